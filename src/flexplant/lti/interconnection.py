@@ -203,10 +203,10 @@ def _others(count: int, chosen: IntArray) -> IntArray:
     return np.flatnonzero(left)
 
 
-def loop_poles(g: StateSpace, K: StateSpace) -> ComplexArray:
+def loop_poles(g: StateSpace, K: StateSpace | Matrices) -> ComplexArray:
     """Return the poles of the loop of g and ``u = K y``, channels of both in one order."""
-    P, back = (g.A, g.B, g.C, g.D), (K.A, K.B, K.C, K.D)
-    A, *_ = _looped(P, back, _well_posed(K.D @ g.D), _well_posed(g.D @ K.D))
+    P, back = (g.A, g.B, g.C, g.D), K if isinstance(K, tuple) else (K.A, K.B, K.C, K.D)
+    A, *_ = _looped(P, back, _well_posed(back[3] @ g.D), _well_posed(g.D @ back[3]))
     return np.asarray(la.eigvals(A), dtype=np.complex128)
 
 

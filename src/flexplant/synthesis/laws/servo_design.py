@@ -15,6 +15,7 @@ from ...errors import ModelError, SolverError, warn
 from ...loop import ClosedLoop
 from ...loop.blocks import drives, driving_blocks
 from ...loop.other_machines import growing_modes, modes_in_words
+from ...lti.frequency_sweep import resonance_grid
 from ...lti.interconnection import loop_poles
 from ...lti.minimal_realisations import minimal
 from ...lti.statespace import StateSpace
@@ -38,6 +39,7 @@ from .servo_loops import (
     gains_at,
     highest_bandwidth,
     lines_of,
+    loop_over,
     observer_system,
     path_of,
     reading_of,
@@ -374,7 +376,7 @@ class ServoTask:
 
     def _holds(self, law: ServoLaw, peak: float) -> bool:
         """Return whether the loop of a law is stable with |S| at u below a peak, on the grid."""
-        return self.loop.peak(law)[0] <= peak and self.radius(law) < 1.0
+        return self.radius(law) < 1.0 and self.loop.peak(law)[0] <= peak
 
     def _suppresses(self, law: ServoLaw, followed: bool = False) -> bool:
         """Return whether every axis, or that with a reference, suppresses errors at a twentieth."""
@@ -383,6 +385,12 @@ class ServoTask:
         far = np.abs(1.0 + np.diag(law.at(low)) * plant) >= 1.0 / _SUPPRESSED
         free = [followed and name not in self.reading.references for name in self.channels]
         return bool(np.all(far | free))
+
+    def _suppressed_up_to(self, law: ServoLaw) -> float:
+        """Return the least frequency [Hz] at which |S| of a reference first crosses 1."""
+        grid = resonance_grid(loop_poles(self.whole, law.matrices), self.plant.dt)
+        own = loop_over(grid, self.plant, self.observer, self.reading, self.plant)
+        return own.suppressed_up_to(law)
 
     def _settling(self, law: ServoLaw) -> ServoLaw:
         """Return a law with integral action as fast as suppresses errors and costs little |S|."""
@@ -403,8 +411,8 @@ class ServoTask:
             if one.axes == law.axes:
                 break
             if self._holds(one, most):
-                up_to = up_to or suppressed_up_to(self.closed(law))
-                if suppressed_up_to(self.closed(one)) >= up_to / _COST:
+                up_to = up_to or self._suppressed_up_to(law)
+                if self._suppressed_up_to(one) >= up_to / _COST:
                     return one
         return law
 
@@ -477,12 +485,16 @@ class ServoTask:
         return found
 
     @cached_property
+    def whole(self) -> StateSpace:
+        """From u to what the servo reads."""
+        return path_of(self.plant, self.observer, self.reading)
+
+    @cached_property
     def path(self) -> tuple[StateSpace, float]:
         """From u to what the servo reads, and the largest size of a pole left out of it."""
-        whole = path_of(self.plant, self.observer, self.reading)
         if not self.searching:
-            return whole, 0.0
-        kept, fixed = minimal(whole), whole.poles()
+            return self.whole, 0.0
+        kept, fixed = minimal(self.whole), self.whole.poles()
         for pole in kept.poles():
             fixed = np.delete(fixed, np.argmin(np.abs(fixed - pole)))
         return kept, float(np.abs(fixed).max(initial=0.0))
@@ -493,7 +505,7 @@ class ServoTask:
 
         @cache
         def found(law: ServoLaw) -> ComplexArray:
-            return loop_poles(self.path[0], StateSpace(*law.matrices, self.plant.dt))
+            return loop_poles(self.path[0], law.matrices)
 
         return found
 
@@ -527,10 +539,10 @@ class ServoTask:
         def holds(bandwidth: float) -> bool:
             nonlocal best
             law = self.law(bandwidth)
-            if self.phase_margins(law).min() <= 0.0:
+            if self.phase_margins(law).min() <= 0.0 or self.radius(law) >= 1.0:
                 return False
             size, at = self.loop.peak(law)
-            if size < best[0] and self.radius(law) < 1.0:
+            if size < best[0]:
                 best = size, at, bandwidth
             if size > peak or not self._suppresses(law, followed=True):
                 return False

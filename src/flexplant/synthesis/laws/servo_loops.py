@@ -240,6 +240,14 @@ class ServoLoop:
     modes: FloatArray
     damping: FloatArray
     plant: StandardPlant
+    #: of the axes with a reference, their numbers and channels
+    referred: Mapping[int, str]
+
+    @cached_property
+    def motion(self) -> ComplexArray:
+        """From u to the axes with a reference (n_freq, k, nu): their true motion."""
+        chosen = self.plant.system.select(list(self.referred.values()), self.plant.u)
+        return _stack(chosen, self.freq)
 
     @cached_property
     def through(self) -> ComplexArray:
@@ -300,6 +308,13 @@ class ServoLoop:
         size = self.size(law)
         top = int(np.argmax(size))
         return float(size[top]), float(self.freq[top])
+
+    def suppressed_up_to(self, law: ServoLaw) -> float:
+        """Return the least frequency [Hz] at which |S| of a reference first crosses 1."""
+        T, at = law.driven.T, self.at(law)
+        moved = np.linalg.solve(np.eye(len(T)) - self.broken(T, at)[0], T * at[:, None, :])
+        error = 1.0 - np.einsum("fij,fji->if", self.motion, moved[:, :, list(self.referred)])
+        return _first_crossing(self.freq, np.abs(error))
 
     def _best_notch(self, law: ServoLaw, modes: Sequence[int]) -> tuple[Notch, float]:
         """Return the further notch that gives the lowest peak of |S|, and that peak.
@@ -450,6 +465,17 @@ def servo_loop(
     grid = resonance_grid(poles, plant.dt, points=300)
     # half the rate itself, where a hold has no answer, is left out
     grid = grid[grid < 0.5 / plant.dt * (1.0 - 1e-6)]
+    return loop_over(grid, plant, observer, reading, known)
+
+
+def loop_over(
+    grid: FloatArray,
+    plant: StandardPlant,
+    observer: StateSpace | None,
+    reading: Reading,
+    known: StandardPlant,
+) -> ServoLoop:
+    """Return the loop on a grid of frequencies [Hz]: see `servo_loop`."""
     direct = [one for one in reading.channels if observer is None or reading.reads[one] == one]
     rows = {name: i for i, name in enumerate(reading.channels)}
     moved = np.zeros((grid.size, len(rows), len(plant.u)), dtype=np.complex128)
@@ -467,7 +493,8 @@ def servo_loop(
         moved[:, at] = E[..., : len(read)] @ _stack(plant.system.select(read, plant.u), grid)
         columns = [plant.u.index(name) for name in given]
         own[np.ix_(range(grid.size), at, columns)] = E[..., len(read) :]
-    return ServoLoop(grid, moved, own if given else None, *oscillations(known), plant)
+    referred = {rows[name]: name for name in reading.references}
+    return ServoLoop(grid, moved, own if given else None, *oscillations(known), plant, referred)
 
 
 def _stack(system: StateSpace, grid: FloatArray) -> ComplexArray:
@@ -535,13 +562,22 @@ def highest_bandwidth(freq: Sequence[float], holds: Callable[[float], bool]) -> 
 
 def suppressed_up_to(closed: ClosedLoop) -> float:
     """Return the least frequency [Hz] of a grid at which |S| of a reference first crosses 1."""
-    plant, found = closed.plant, []
+    plant = closed.plant
     pairs = {name: f"{name.removesuffix(':ref')}:error" for name in references(plant)}
     response = closed.frequency_response(closed.broken.grid)
-    for reference, error in pairs.items():
-        if error in plant.z:
-            gain = response.data[plant.z.index(error), plant.w.index(reference)]
-            below = np.logical_or.accumulate(np.abs(gain) < 1.0)
-            above = np.flatnonzero((np.abs(gain) >= 1.0) & (below | ~below[-1]))
-            found.append(float(response.freq[above[0] if above.size else -1]))
+    sizes = [
+        np.abs(response.data[plant.z.index(error), plant.w.index(reference)])
+        for reference, error in pairs.items()
+        if error in plant.z
+    ]
+    return _first_crossing(response.freq, sizes)
+
+
+def _first_crossing(freq: FloatArray, sizes: Iterable[FloatArray]) -> float:
+    """Return the least frequency [Hz] at which one of some sizes of |S| first crosses 1."""
+    found = []
+    for size in sizes:
+        below = np.logical_or.accumulate(size < 1.0)
+        above = np.flatnonzero((size >= 1.0) & (below | ~below[-1]))
+        found.append(float(freq[above[0] if above.size else -1]))
     return min(found, default=0.0)
