@@ -421,7 +421,7 @@ class ServoTask:
         stable = [law for law in laws if self.radius(law) < 1.0] if len(laws) > 1 else laws
         if not stable:
             return min(laws, key=self.radius)
-        return stable[0] if len(stable) == 1 else min(stable, key=self.loop.peak)
+        return self.loop.lowest(stable)
 
     def axis(self, line: str, bandwidth: float, gain: float, lead: float = LEADS[0]) -> Axis:
         """Return the law of an axis on a line, whose plant has a gain there."""

@@ -275,12 +275,6 @@ class ServoLoop:
         loop = self.broken(T, at, some)
         return peaking_size(sensitivity(*loop)) if self.mixed else sensitivity_size(*loop)
 
-    def _at_least(self, T: FloatArray, at: ComplexArray, some: Any) -> float:
-        """Return a lower bound of the largest sigma_max(S_u)."""
-        if self.mixed:
-            return float(least_scaled(sensitivity(*self.broken(T, at, some))).max())
-        return float(self._sizes(T, at, some).max())
-
     @cached_property
     def at(self) -> Callable[[ServoLaw], ComplexArray]:
         """The function of a law that gives its responses over the grid."""
@@ -316,36 +310,39 @@ class ServoLoop:
         error = 1.0 - np.einsum("fij,fji->if", self.motion, moved[:, :, list(self.referred)])
         return _first_crossing(self.freq, np.abs(error))
 
-    def _best_notch(self, law: ServoLaw, modes: Sequence[int]) -> tuple[Notch, float]:
-        """Return the further notch that gives the lowest peak of |S|, and that peak.
+    def _at_least(self, law: ServoLaw, like: ServoLaw) -> float:
+        """Return a lower bound of max_f sigma_max(S_u): that where the loop of a like law peaks."""
+        T, at, size = law.driven.T, self.at(law), self.size(like)
+        some = np.flatnonzero(size >= _HIGH * size.max())
+        if self.mixed:
+            return float(least_scaled(sensitivity(*self.broken(T, at, some))).max())
+        return float(self._sizes(T, at, some).max())
+
+    def lowest(self, laws: Sequence[ServoLaw]) -> ServoLaw:
+        """Return the law with the lowest peak of |S|, the first of equals."""
+        best, *others = laws
+        for law in others:
+            least = self.peak(best)[0]
+            # else too high already where the loop of the best peaks
+            if self._at_least(law, best) < least and self.peak(law)[0] < least:
+                best = law
+        return best
+
+    def _with_notch(self, law: ServoLaw, modes: Sequence[int]) -> ServoLaw:
+        """Return the law with the further notch that gives the lowest peak of |S|.
 
         It is a narrow one where that brings |S| below 6 dB: wide ones take more phase.
         """
         narrow, *wider = _WIDTHS
-        best = self._lowest(law, [self._inverse(mode, narrow) for mode in modes])
-        found = best[0]
-        shallow = _notch(found.freq, max(found.depth, Notch(1.0).depth), found.width)  # less phase
-        best = self._lowest(law, [shallow] if shallow is not found else [], best)
+        tried = [law.notched(self._inverse(mode, narrow)) for mode in modes]
+        best = self.lowest(sorted(tried, key=lambda one: self._at_least(one, law)))
+        freq, depth = best.notches[-1].freq, max(best.notches[-1].depth, Notch(1.0).depth)
+        best = self.lowest([best, law.notched(_notch(freq, depth, narrow))])  # less phase
         for width in wider:
-            if best[1] <= _BELOW_TARGET * TARGET:
+            if self.peak(best)[0] <= _BELOW_TARGET * TARGET:
                 break
-            other = _notch(best[0].freq, best[0].depth * best[0].width / width, width)
-            best = self._lowest(law, [other], best)
-        return best
-
-    def _lowest(
-        self, law: ServoLaw, notches: Sequence[Notch], best: tuple[Notch, float] | None = None
-    ) -> tuple[Notch, float]:
-        """Return the notch with the lowest peak, and that peak, if it is lower than the best."""
-        T, size = law.driven.T, self.size(law)
-        high = np.flatnonzero(size >= _HIGH * size.max())
-        tried = [self.at(law.notched(notch)) for notch in notches]
-        least = np.array([self._at_least(T, one, high) for one in tried])
-        best = best or (notches[0], np.inf)
-        for i in np.argsort(least, kind="stable").tolist():
-            if least[i] < best[1]:  # else too high already where the loop is high without it
-                found = float(self._sizes(T, tried[i]).max())
-                best = (notches[i], found) if found < best[1] else best
+            depth = best.notches[-1].depth * best.notches[-1].width / width
+            best = self.lowest([best, law.notched(_notch(freq, depth, width))])
         return best
 
     @cached_property
@@ -391,14 +388,12 @@ class ServoLoop:
             left = left[:_TRIED] if stable else self._driven(left, inside)
             if not left:
                 break
-            size = self.size(law)
-            notch, lower = self._best_notch(law, left)
-            further = law.notched(notch)
+            further = self._with_notch(law, left)
             outside = poles(further)
             # of an unstable loop |S| says little: a notch is to slow the growth
             if np.abs(outside).max() >= max(1.0, np.abs(inside).max()):
                 break
-            if stable and lower > _GAIN * size.max():
+            if stable and self.peak(further)[0] > _GAIN * self.peak(law)[0]:
                 break
             law, inside = further, outside
         return law
