@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,8 @@ _OF_RATE, _OF_MODE = 0.01, 0.2
 _UNLIKE = 2.0
 #: what counts as rest, relative to a usual bandwidth: squared it is below what tests of rest see
 _RESTING = 1e-4
+#: sets of axes of which is kept whether they are moved apart: many bandwidths are tried
+_RESTED = 8
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -132,7 +135,7 @@ def driven_axes(
     for channels in sets:
         # at rest: above its modes a machine may not pass on what it moves apart below them, and
         # that is a matter of the bandwidth, not of the places
-        if apart(_at_rest(plant, channels)):
+        if _apart_at_rest(plant, channels):
             if axes is None and poi is None:
                 channels, drifting = _holding(plant, channels)
                 if drifting.size:
@@ -272,6 +275,11 @@ def felt(
     G = g.C[rows] @ states + g.D[np.ix_(rows, columns)]
     most = np.abs(g.C[rows]) @ np.abs(states)
     return np.asarray(np.where(np.abs(G) > TYPED * most, G, 0.0))
+
+
+@lru_cache(maxsize=_RESTED)
+def _apart_at_rest(plant: Partition, channels: tuple[str, ...]) -> bool:
+    return apart(_at_rest(plant, channels))
 
 
 def _at_rest(plant: Partition, channels: Sequence[str]) -> FloatArray:

@@ -220,8 +220,8 @@ class Law(LawElement):
                     f"mean nothing there. Sample the law at {factor.own_rate:g} Hz, or take the "
                     "block before it was sampled."
                 )
-            if centre := factor.section.centre:
-                below_half_rate(centre / (2.0 * np.pi), str(factor), rate)
+            if rate and (centre := factor.section.centre / (2.0 * np.pi)) >= 0.5 * rate:
+                below_half_rate(centre, str(factor), rate)
         gain = float(real_array(self.gain, "gain", ()))
         self._set(
             factors=factors, gain=gain, rate=rate, prewarped=flag(self.prewarped, "prewarped")
@@ -286,7 +286,7 @@ def decoupled(laws: Iterable[Matrices], before: FloatArray, after: FloatArray) -
     return A, -B @ after, before @ C, -before @ D @ after
 
 
-def tustin_s(freq: FloatArray, rate: float) -> ComplexArray:
+def tustin_s(freq: FloatArray | float, rate: float) -> ComplexArray:
     """Return ``2 rate (z - 1) / (z + 1)`` at frequencies [Hz]; j omega of a continuous law."""
     omega = 2.0 * rate * np.tan(np.pi * freq / rate) if rate else 2.0 * np.pi * freq
     return np.asarray(1j * omega, dtype=np.complex128)

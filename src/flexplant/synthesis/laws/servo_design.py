@@ -323,22 +323,25 @@ class ServoTask:
                     f"needs room above it. Stay below {0.2 * self.rate:g} Hz, or raise the rate."
                 )
         exact, smooth = np.abs(gains_at(self.plant, driven)), (2.0 * np.pi * driven.freq) ** -2.0
-        best, modes = self._law(self._plain(driven, exact)), elastic(self.plant)[:, None]
+        lines = combinations(lines_of(self.plant, driven))
+        best, modes = self._law(self._plain(driven, exact, lines)), elastic(self.plant)[:, None]
         # next to a resonance the response says little of the axis: that on the real axis does
         near = np.any(np.abs(np.log(modes / driven.freq)) < _RESONANT, axis=0)
         if not np.any(near & (np.abs(np.log(exact / smooth)) > _RESONANT)) or self._serves(best):
             return best
-        other = self._plain(driven, smooth)
+        other = self._plain(driven, smooth, lines)
         if self.radius(other) < 1.0 and self._serves(other := self._law(other)):
             return other
         return best
 
-    def _plain(self, driven: DrivenAxes, gains: FloatArray) -> ServoLaw:
+    def _plain(
+        self, driven: DrivenAxes, gains: FloatArray, lines: Sequence[tuple[str, ...]]
+    ) -> ServoLaw:
         """Return the laws, without notches, on the best lines of axes with these gains."""
         notches, numbers = tuple(map(Notch, self.notches or ())), (driven.freq, gains)
         tried = [
-            ServoLaw(driven, tuple(map(self.axis, lines, *(n.tolist() for n in numbers))), notches)
-            for lines in combinations(lines_of(self.plant, driven))
+            ServoLaw(driven, tuple(map(self.axis, each, *(n.tolist() for n in numbers))), notches)
+            for each in lines
         ]
         able = [one for one in tried if self.phase_margins(one).min() > 0.0]
         return self._best(able) if able else tried[0]
@@ -350,11 +353,9 @@ class ServoTask:
         best = self._settling(self.notched(plain))
         if all(axis.line != "mass" for axis in plain.axes):
             return best
-        seen = self.loop.modes[self.loop.resonant(plain)]
-        near = bool(np.any(seen < _NEAR * plain.driven.freq.min()))
         for lead in LEADS[1:]:
             # the widest leads only where the others do not serve: they cost most noise
-            if not (near and lead == LEADS[1]) and self._holds(best, TARGET):
+            if self._holds(best, TARGET) and not (lead == LEADS[1] and self._resonates(plain)):
                 break
             axes = (self.axis(a.line, a.bandwidth, a.gain, lead) for a in plain.axes)
             wide = self.notched(plain.of(axes))
@@ -362,6 +363,11 @@ class ServoTask:
                 wide = self._settling(wide)
                 best = wide if self._suppresses(wide) or not self._suppresses(best) else best
         return best
+
+    def _resonates(self, law: ServoLaw) -> bool:
+        """Return whether the loop of a law resonates a little above the bandwidth."""
+        seen = self.loop.modes[self.loop.resonant(law)]
+        return bool(np.any(seen < _NEAR * law.driven.freq.min()))
 
     def _runs(self, law: ServoLaw) -> bool:
         """Return whether the loop is stable, with the truncated modes where they are known."""
@@ -446,10 +452,9 @@ class ServoTask:
         """Return the phases [rad] (r,) that remain of -pi at the bandwidth, on each axis's line."""
         # hold and delay turn a line as they turn the plant; its modes are not in it, and the
         # notches at them neither
-        if self.notches is None:
-            law = law._replace(notches=())
         late = np.array([2.0 * np.pi * a.bandwidth for a in law.axes]) * self.plant.dt
-        turned = np.diag(law.at(law.driven.freq))
+        given = [law.there(notch) for notch in law.notches if self.notches is not None]
+        turned = np.array([a.turn for a in law.axes]) * np.prod(given, axis=0)
         lines = np.array([POWERS.get(a.line, 1.0) for a in law.axes])
         own = np.angle(turned * 1j ** -(lines - 1.0)) - 0.5 * np.pi
         return np.asarray(own - late * (0.5 + self.plant.delay) + np.pi)

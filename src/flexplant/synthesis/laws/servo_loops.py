@@ -22,7 +22,7 @@ from ...lti.statespace import StateSpace
 from ...plant import EvaluationModel, Foreign, StandardPlant
 from ...plant.axes import DrivenAxes, complex_gain, force_units, oscillations
 from .controller_elements import Integrator, LowPass, Notch, Pid
-from .law import Law, decoupled, tustin_s
+from .law import Law, decoupled, product, tustin_s
 
 #: the lead of a mass line: its zero lies this factor below the bandwidth, its pole above. With 4
 #: |S| of a free mass peaks near 4 dB with the roll-off and integrator of `design_servo`. Where a
@@ -90,13 +90,25 @@ class Axis:
 
     def law(self, notches: Sequence[Notch]) -> Law:
         """Return the law with notches, from error to command."""
-        law = Law((*self.action, LowPass(self.rolloff), *notches), rate=self.rate)
-        return law * float(1.0 / (abs(law.at(np.array([self.bandwidth]))[0]) * self.gain))
+        factors = (*self.action, LowPass(self.rolloff), *notches)
+        there = product(
+            (one.section.at(self.rate) for one in factors), tustin_s(self.bandwidth, self.rate)
+        )
+        return Law(factors, float(1.0 / (abs(there) * self.gain)), self.rate)
 
-    @cached_property
+    @property
     def shape(self) -> Law:
         """The law without notches of a plant of gain 1 at the bandwidth, for all such axes."""
-        return _shape(replace(self, gain=1.0))
+        return self._shaped[0]
+
+    @property
+    def turn(self) -> complex:
+        """The response of the shape at the bandwidth, of size 1."""
+        return self._shaped[1]
+
+    @cached_property
+    def _shaped(self) -> tuple[Law, complex]:
+        return _shape(self if self.gain == 1.0 else replace(self, gain=1.0))
 
     @property
     def action(self) -> tuple[Pid | Integrator, ...]:
@@ -111,8 +123,9 @@ class Axis:
 
 
 @lru_cache(maxsize=_KEPT)
-def _shape(axis: Axis) -> Law:
-    return axis.law(())
+def _shape(axis: Axis) -> tuple[Law, complex]:
+    law = axis.law(())
+    return law, complex(law.at(np.array(axis.bandwidth)))
 
 
 @lru_cache(maxsize=_NOTCHES * _KEPT)
@@ -198,9 +211,13 @@ class ServoLaw(NamedTuple):
 
     def gains(self, notch: Notch) -> FloatArray:
         """Return the gains (r,) of a notch at the bandwidths, which the laws make up for."""
+        return np.abs(self.there(notch))
+
+    def there(self, notch: Notch) -> ComplexArray:
+        """Return the responses (r,) of a notch at the bandwidths."""
         rate = self.axes[0].rate
         s = tustin_s(np.array([axis.bandwidth for axis in self.axes]), rate)
-        return np.abs(notch.section.at(rate).gain(s))
+        return notch.section.at(rate).gain(s)
 
     def at(self, freq: FloatArray) -> ComplexArray:
         """Return the responses (n_freq, r) of the laws."""
