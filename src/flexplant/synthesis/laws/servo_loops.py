@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from ...arrays import ComplexArray, FloatArray
+from ...arrays import ComplexArray, FloatArray, IntArray
 from ...errors import LabelError, warn
 from ...loop import ClosedLoop
 from ...loop.blocks import as_block, references
@@ -108,7 +109,8 @@ class Axis:
 
     @cached_property
     def _shaped(self) -> tuple[Law, complex]:
-        return _shape(self if self.gain == 1.0 else replace(self, gain=1.0))
+        own = self.line, self.bandwidth, self.rolloff, self.integrator
+        return _shape(*own, self.rate, self.lead)
 
     @property
     def action(self) -> tuple[Pid | Integrator, ...]:
@@ -123,9 +125,11 @@ class Axis:
 
 
 @lru_cache(maxsize=_KEPT)
-def _shape(axis: Axis) -> tuple[Law, complex]:
-    law = axis.law(())
-    return law, complex(law.at(np.array(axis.bandwidth)))
+def _shape(
+    line: str, bandwidth: float, rolloff: float, integrator: float, rate: float, lead: float
+) -> tuple[Law, complex]:
+    law = Axis(line, bandwidth, rolloff, integrator, 1.0, rate, lead).law(())
+    return law, complex(law.at(np.array(bandwidth)))
 
 
 @lru_cache(maxsize=_NOTCHES * _KEPT)
@@ -278,19 +282,35 @@ class ServoLoop:
         return bool(mixed_units(plant.u, plant.units, lambda: force_units(plant)))
 
     def broken(
-        self, T: FloatArray, at: ComplexArray, some: Any = slice(None)
+        self, law: ServoLaw, some: IntArray | slice = slice(None)
     ) -> tuple[ComplexArray, ComplexArray | None]:
         """Return L (k, nu, nu) with all paths, and the inner loop of the observer's u."""
-        act = -T * at[some, None, :]
+        act = -law.driven.T * self.at(law)[some, None, :]
         return act @ self.through[some], None if self.own is None else act @ self.own[some]
 
-    def _sizes(self, T: FloatArray, at: ComplexArray, some: Any = slice(None)) -> FloatArray:
+    def _sizes(self, law: ServoLaw, some: IntArray) -> FloatArray:
         """Return sigma_max(S_u) at some points, a lower bound where it is not the largest.
 
         It says nothing of stability, so check that.
         """
-        loop = self.broken(T, at, some)
-        return peaking_size(sensitivity(*loop)) if self.mixed else sensitivity_size(*loop)
+        size, some = np.zeros(some.size), some[may := self._may_peak(law)[some]]
+        loop = self.broken(law, some)
+        size[may] = peaking_size(sensitivity(*loop)) if self.mixed else sensitivity_size(*loop)
+        return size
+
+    @cached_property
+    def _may_peak(self) -> Callable[[ServoLaw], npt.NDArray[np.bool_]]:
+        """The function of a law that says at which points sigma_max(S_u) may be 1 or more."""
+        # with q and k the norms of L^-1 and of L^-1 times the inner loop it is at most
+        # (q + k) / (1 - q). L^-1 is a sum over the axes, each a column times a row
+        through, own = self.through, self.own
+        if through.shape[1] < through.shape[2]:
+            return lambda law: np.ones(self.freq.size, dtype=bool)
+        inverse = np.linalg.inv(through)
+        columns = np.linalg.norm(inverse, axis=1)
+        k = 0.0 if own is None else np.linalg.norm(inverse @ own, axis=(1, 2))
+        rows = lru_cache(lambda axes: np.linalg.norm(np.linalg.inv(axes.T), axis=1))
+        return lambda law: 2.0 * (columns / np.abs(self.at(law))) @ rows(law.driven) + k >= 1.0
 
     @cached_property
     def at(self) -> Callable[[ServoLaw], ComplexArray]:
@@ -312,7 +332,8 @@ class ServoLoop:
     @cached_property
     def size(self) -> Callable[[ServoLaw], FloatArray]:
         """The function of a law that gives sigma_max(S_u) over the grid."""
-        return lru_cache(lambda law: self._sizes(law.driven.T, self.at(law)))
+        every = np.arange(self.freq.size)
+        return lru_cache(lambda law: self._sizes(law, every))
 
     def peak(self, law: ServoLaw) -> tuple[float, float]:
         """Return max_f sigma_max(S_u) over the grid and its frequency [Hz]."""
@@ -322,18 +343,18 @@ class ServoLoop:
 
     def suppressed_up_to(self, law: ServoLaw) -> float:
         """Return the least frequency [Hz] at which |S| of a reference first crosses 1."""
-        T, at = law.driven.T, self.at(law)
-        moved = np.linalg.solve(np.eye(len(T)) - self.broken(T, at)[0], T * at[:, None, :])
+        T, L = law.driven.T, self.broken(law)[0]
+        moved = np.linalg.solve(np.eye(len(T)) - L, T * self.at(law)[:, None, :])
         error = 1.0 - np.einsum("fij,fji->if", self.motion, moved[:, :, list(self.referred)])
         return _first_crossing(self.freq, np.abs(error))
 
     def _at_least(self, law: ServoLaw, like: ServoLaw) -> float:
         """Return a lower bound of max_f sigma_max(S_u): that where the loop of a like law peaks."""
-        T, at, size = law.driven.T, self.at(law), self.size(like)
+        size = self.size(like)
         some = np.flatnonzero(size >= _HIGH * size.max())
         if self.mixed:
-            return float(least_scaled(sensitivity(*self.broken(T, at, some))).max())
-        return float(self._sizes(T, at, some).max())
+            return float(least_scaled(sensitivity(*self.broken(law, some))).max())
+        return float(self._sizes(law, some).max())
 
     def lowest(self, laws: Sequence[ServoLaw]) -> ServoLaw:
         """Return the law with the lowest peak of |S|, the first of equals."""
