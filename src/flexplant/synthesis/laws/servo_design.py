@@ -38,6 +38,7 @@ from .servo_loops import (
     combinations,
     gains_at,
     highest_bandwidth,
+    known_axis,
     lines_of,
     loop_over,
     observer_system,
@@ -338,9 +339,9 @@ class ServoTask:
         self, driven: DrivenAxes, gains: FloatArray, lines: Sequence[tuple[str, ...]]
     ) -> ServoLaw:
         """Return the laws, without notches, on the best lines of axes with these gains."""
-        notches, numbers = tuple(map(Notch, self.notches or ())), (driven.freq, gains)
+        notches, level = tuple(map(Notch, self.notches or ())), tuple(gains.tolist())
         tried = [
-            ServoLaw(driven, tuple(map(self.axis, each, *(n.tolist() for n in numbers))), notches)
+            ServoLaw(driven, tuple(map(self.axis, each, driven.freq.tolist())), level, notches)
             for each in lines
         ]
         able = [one for one in tried if self.phase_margins(one).min() > 0.0]
@@ -357,7 +358,7 @@ class ServoTask:
             # the widest leads only where the others do not serve: they cost most noise
             if self._holds(best, TARGET) and not (lead == LEADS[1] and self._resonates(plain)):
                 break
-            axes = (self.axis(a.line, a.bandwidth, a.gain, lead) for a in plain.axes)
+            axes = (self.axis(a.line, a.bandwidth, lead) for a in plain.axes)
             wide = self.notched(plain.of(axes))
             if self._runs(wide) and self._best([best, wide]) is wide:
                 wide = self._settling(wide)
@@ -405,9 +406,7 @@ class ServoTask:
 
         def faster(parts: Iterable[float]) -> Iterator[ServoLaw]:
             for part in parts:
-                yield law.of(
-                    replace(a, integrator=max(a.integrator, part * a.bandwidth)) for a in law.axes
-                )
+                yield law.of(axis.faster(part) for axis in law.axes)
 
         if not self._suppresses(law):
             able = (one for one in faster(reversed(_CORNERS)) if self._suppresses(one))
@@ -429,8 +428,8 @@ class ServoTask:
             return min(laws, key=self.radius)
         return self.loop.lowest(stable)
 
-    def axis(self, line: str, bandwidth: float, gain: float, lead: float = LEADS[0]) -> Axis:
-        """Return the law of an axis on a line, whose plant has a gain there."""
+    def axis(self, line: str, bandwidth: float, lead: float = LEADS[0]) -> Axis:
+        """Return the law of an axis on a line."""
         wide = line == "mass" and lead != LEADS[0]
         usual = min((lead if wide else _ROLLOFF[line]) * bandwidth, 0.4 * self.rate)
         rolloff = usual if self.rolloff is None else self.rolloff
@@ -439,7 +438,7 @@ class ServoTask:
         for name, freq in (("rolloff", rolloff), ("integrator", slow)):
             below_half_rate(freq, name, self.rate)
         corners = float(rolloff), float(slow)
-        return Axis(line, bandwidth, *corners, gain, self.rate, lead if wide else LEADS[0])
+        return known_axis(line, bandwidth, *corners, self.rate, lead if wide else LEADS[0])
 
     @cached_property
     def notched(self) -> Callable[[ServoLaw], ServoLaw]:
@@ -481,8 +480,8 @@ class ServoTask:
         def found(law: ServoLaw) -> StateSpace:
             before = StateSpace([], [], [], law.driven.T, inputs=reads, outputs=self.plant.u)
             axes = Axes(None, before, after, self.rate)
-            each = zip(reads, law.axes, strict=True)
-            laws = {name: axis.law(law.notches) for name, axis in each}
+            each = zip(reads, law.axes, law.level, strict=True)
+            laws = {name: axis.law(law.notches) / level for name, axis, level in each}
             system = connected(axes, axes_controller(axes, laws), read)
             system = system.select(inputs=[*read.values(), *reads])
             return system.replace(name="servo", units=self.plant.units)

@@ -71,9 +71,9 @@ _QUIET = 0.3
 _KEPT = 8
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Axis:
-    """The law of an axis, sampled by Tustin's rule, with which its loop crosses 1 at the bandwidth.
+    """The law of an axis, sampled by Tustin's rule, of gain 1 at the bandwidth.
 
     On a mass line ``(1 + w_i / s) (1 + r s / w_b) / (1 + s / (r w_b)) F(s)`` with the lead r, on
     that of a damper ``(1 + w_i / s) F(s)``, of a spring ``F(s) / s``, of a response that vanishes
@@ -84,10 +84,8 @@ class Axis:
     bandwidth: float
     rolloff: float
     integrator: float
-    #: of the plant at the bandwidth, decoupled: exact
-    gain: float
     rate: float
-    lead: float = LEADS[0]
+    lead: float
 
     def law(self, notches: Sequence[Notch]) -> Law:
         """Return the law with notches, from error to command."""
@@ -95,22 +93,22 @@ class Axis:
         there = product(
             (one.section.at(self.rate) for one in factors), tustin_s(self.bandwidth, self.rate)
         )
-        return Law(factors, float(1.0 / (abs(there) * self.gain)), self.rate)
-
-    @property
-    def shape(self) -> Law:
-        """The law without notches of a plant of gain 1 at the bandwidth, for all such axes."""
-        return self._shaped[0]
-
-    @property
-    def turn(self) -> complex:
-        """The response of the shape at the bandwidth, of size 1."""
-        return self._shaped[1]
+        return Law(factors, float(1.0 / abs(there)), self.rate)
 
     @cached_property
-    def _shaped(self) -> tuple[Law, complex]:
-        own = self.line, self.bandwidth, self.rolloff, self.integrator
-        return _shape(*own, self.rate, self.lead)
+    def shape(self) -> Law:
+        """The law without notches."""
+        return self.law(())
+
+    @cached_property
+    def turn(self) -> complex:
+        """The response of the shape at the bandwidth, of size 1."""
+        return complex(self.shape.at(np.array(self.bandwidth)))
+
+    def faster(self, part: float) -> Axis:
+        """Return the law with integral action up to a part of the bandwidth, or faster."""
+        corner = max(self.integrator, part * self.bandwidth)
+        return known_axis(self.line, self.bandwidth, self.rolloff, corner, self.rate, self.lead)
 
     @property
     def action(self) -> tuple[Pid | Integrator, ...]:
@@ -124,12 +122,8 @@ class Axis:
         return (Pid(0.0, i=1.0),) if self.line == "spring" else ()
 
 
-@lru_cache(maxsize=_KEPT)
-def _shape(
-    line: str, bandwidth: float, rolloff: float, integrator: float, rate: float, lead: float
-) -> tuple[Law, complex]:
-    law = Axis(line, bandwidth, rolloff, integrator, 1.0, rate, lead).law(())
-    return law, complex(law.at(np.array(bandwidth)))
+#: equal laws are one, so that what is known of it is found at once
+known_axis = lru_cache(maxsize=_NOTCHES * _KEPT)(Axis)
 
 
 @lru_cache(maxsize=_NOTCHES * _KEPT)
@@ -202,6 +196,8 @@ class ServoLaw(NamedTuple):
 
     driven: DrivenAxes
     axes: tuple[Axis, ...]
+    #: gains (r,) of the plant at the bandwidths, decoupled: exact
+    level: tuple[float, ...]
     #: which all axes have in common
     notches: tuple[Notch, ...] = ()
 
@@ -225,10 +221,8 @@ class ServoLaw(NamedTuple):
 
     def at(self, freq: FloatArray) -> ComplexArray:
         """Return the responses (n_freq, r) of the laws."""
-        shapes, rate = [axis.shape for axis in self.axes], self.axes[0].rate
-        found = {one: one.at(freq) for one in dict.fromkeys(shapes)}
-        each = zip(shapes, self.axes, strict=True)
-        at = np.stack([found[one] / axis.gain for one, axis in each], axis=-1)
+        found, rate = {one: one.shape.at(freq) for one in set(self.axes)}, self.axes[0].rate
+        at = np.stack([found[one] for one in self.axes], axis=-1) / self.level
         for notch in self.notches:
             at *= notch.section.at(rate).gain(tustin_s(freq, rate))[:, None] / self.gains(notch)
         return at
@@ -238,8 +232,7 @@ class ServoLaw(NamedTuple):
         """A, B, C and D from what the servo reads to the actuators."""
         notched = np.prod([self.gains(notch) for notch in self.notches], axis=0)
         parts = []
-        gains = notched * np.array([axis.gain for axis in self.axes])
-        for axis, gain in zip(self.axes, gains, strict=True):
+        for axis, gain in zip(self.axes, notched * np.array(self.level), strict=True):
             A, B, C, D = _series(axis.shape, self.notches)
             parts.append((A, B, C / gain, D / gain))
         return decoupled(parts, self.driven.T, np.eye(len(self.axes)))
@@ -289,14 +282,8 @@ class ServoLoop:
         return act @ self.through[some], None if self.own is None else act @ self.own[some]
 
     def _sizes(self, law: ServoLaw, some: IntArray) -> FloatArray:
-        """Return sigma_max(S_u) at some points, a lower bound where it is not the largest.
-
-        It says nothing of stability, so check that.
-        """
-        size, some = np.zeros(some.size), some[may := self._may_peak(law)[some]]
         loop = self.broken(law, some)
-        size[may] = peaking_size(sensitivity(*loop)) if self.mixed else sensitivity_size(*loop)
-        return size
+        return peaking_size(sensitivity(*loop)) if self.mixed else sensitivity_size(*loop)
 
     @cached_property
     def _may_peak(self) -> Callable[[ServoLaw], npt.NDArray[np.bool_]]:
@@ -331,9 +318,18 @@ class ServoLoop:
 
     @cached_property
     def size(self) -> Callable[[ServoLaw], FloatArray]:
-        """The function of a law that gives sigma_max(S_u) over the grid."""
-        every = np.arange(self.freq.size)
-        return lru_cache(lambda law: self._sizes(law, every))
+        """The function of a law that gives sigma_max(S_u) over the grid.
+
+        It is a lower bound where it is not the largest. It says nothing of stability: check that.
+        """
+
+        @lru_cache
+        def found(law: ServoLaw) -> FloatArray:
+            size, may = np.zeros(self.freq.size), np.flatnonzero(self._may_peak(law))
+            size[may] = self._sizes(law, may)
+            return size
+
+        return found
 
     def peak(self, law: ServoLaw) -> tuple[float, float]:
         """Return max_f sigma_max(S_u) over the grid and its frequency [Hz]."""
