@@ -28,6 +28,7 @@ from ..controller import CLOSE, Controller, with_checks
 from .controller_elements import Notch
 from .law import Axes, axes_controller, connected
 from .servo_loops import (
+    FAR,
     LEADS,
     POWERS,
     TARGET,
@@ -537,25 +538,25 @@ class ServoTask:
         """Return the largest bandwidth that holds a peak of |S| at u."""
         best: tuple[float, float, float] = (np.inf, np.nan, np.nan)
 
-        def fine(loop: Any) -> bool:
-            return bool(loop.is_stable and loop.modulus_margin >= 1.0 / peak)
-
-        def holds(bandwidth: float) -> bool:
+        def excess(bandwidth: float) -> float:
             nonlocal best
             law = self.law(bandwidth)
             if self.phase_margins(law).min() <= 0.0 or self.radius(law) >= 1.0:
-                return False
+                return np.inf
             size, at = self.loop.peak(law)
             if size < best[0]:
                 best = size, at, bandwidth
             if size > peak or not self._suppresses(law, followed=True):
-                return False
+                return size / peak if size > peak else FAR
             closed = self.closed(law)
+            margin = closed.modulus_margin
             # the loop on the evaluation model, which costs most, only if the smaller loop is good
-            return fine(closed) and (closed.left_out is None or fine(closed.left_out))
+            if margin >= 1.0 / peak and closed.completed is not None:
+                margin = closed.completed.modulus_margin
+            return 1.0 / (peak * margin) if margin else np.inf
 
         trials = np.geomspace(0.19 * self.rate, _SLOWEST * self.rate, _TRIALS)
-        found = highest_bandwidth(trials.tolist(), holds)
+        found = highest_bandwidth(trials.tolist(), excess)
         if found is None:
             raise SolverError(
                 f"no bandwidth from {trials[-1]:.3g} to {trials[0]:.3g} Hz holds |S| at u below "

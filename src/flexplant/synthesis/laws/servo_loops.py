@@ -66,6 +66,8 @@ _DRIVEN = 0.3
 _QUIET = 0.3
 
 
+#: |S| relative to what is asked from which on the next bandwidth is not tried
+FAR = 3.0
 #: loops of this number of plants are kept: their designs at other bandwidths begin with them; and
 #: laws of this number of axes
 _KEPT = 8
@@ -577,15 +579,25 @@ def observer_system(
     return inner
 
 
-def highest_bandwidth(freq: Sequence[float], holds: Callable[[float], bool]) -> float | None:
-    """Return the largest frequency that holds: of a descending grid, then by bisection above."""
-    i = next((i for i, one in enumerate(freq) if holds(one)), None)
-    if not i:  # none, or the first
-        return None if i is None else freq[0]
-    low, high = freq[i], freq[i - 1]
-    for _ in range(6):
+def highest_bandwidth(freq: Sequence[float], excess: Callable[[float], float]) -> float | None:
+    """Return the largest frequency that holds: of a descending grid, then by bisection above.
+
+    An excess of at most 1 holds. After a large one the next frequency is left out, and tried only
+    if no other holds.
+    """
+    i, above, left = 0, 0, []
+    while i < len(freq) and (size := excess(freq[i])) > 1.0:
+        left += [i + 1] if size > FAR else []
+        above, i = i, i + (2 if size > FAR else 1)
+    if i >= len(freq):
+        i = next((one for one in left if one < len(freq) and excess(freq[one]) <= 1.0), i)
+        above = i - 1
+    if not 0 < i < len(freq):  # none, or the first
+        return freq[0] if not i else None
+    low, high = freq[i], freq[above]
+    for _ in range(5 + i - above):
         middle = float(np.sqrt(low * high))
-        low, high = (middle, high) if holds(middle) else (low, middle)
+        low, high = (middle, high) if excess(middle) <= 1.0 else (low, middle)
     return low
 
 
