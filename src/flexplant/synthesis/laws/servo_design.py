@@ -41,7 +41,6 @@ from .servo_loops import (
     highest_bandwidth,
     known_axis,
     lines_of,
-    loop_over,
     observer_system,
     path_of,
     reading_of,
@@ -397,8 +396,7 @@ class ServoTask:
     def _suppressed_up_to(self, law: ServoLaw) -> float:
         """Return the least frequency [Hz] at which |S| of a reference first crosses 1."""
         grid = resonance_grid(loop_poles(self.whole, law.matrices), self.plant.dt)
-        own = loop_over(grid, self.plant, self.observer, self.reading, self.plant)
-        return own.suppressed_up_to(law)
+        return replace(self.loop, freq=grid, plant=self.plant).suppressed_up_to(law)
 
     def _settling(self, law: ServoLaw) -> ServoLaw:
         """Return a law with integral action as fast as suppresses errors and costs little |S|."""

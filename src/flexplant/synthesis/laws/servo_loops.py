@@ -240,6 +240,31 @@ class ServoLaw(NamedTuple):
         return decoupled(parts, self.driven.T, np.eye(len(self.axes)))
 
 
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """What a servo reads for each axis: the estimate of a POI's, or the sensor itself."""
+
+    channels: tuple[str, ...]
+    #: of the channel: its estimate or sensor, and its reference where there is one
+    reads: Mapping[str, str]
+    references: Mapping[str, str]
+
+    @property
+    def estimates(self) -> list[str]:
+        """What an observer has to give."""
+        return [one for channel, one in self.reads.items() if one != channel]
+
+    def warn_of_held(self, axes: Sequence[str] | None) -> None:
+        """Warn of sensors that stand for a motion that no POI shows, where axes are not given."""
+        held = [channel for channel, one in self.reads.items() if one == channel]
+        if axes is None and held and self.references:
+            warn(
+                "no axis of a POI shows a free motion that the actuators move, so that the servo "
+                f"holds {', '.join(held)} at zero, also while references move the POIs. Add a Poi "
+                "that shows this motion to move otherwise, or name the axes, axes=[...]."
+            )
+
+
 @dataclass(frozen=True)
 class ServoLoop:
     """The loop of a servo over frequency, broken where `ClosedLoop.broken` breaks it.
@@ -249,26 +274,53 @@ class ServoLoop:
     """
 
     freq: FloatArray
-    #: E_y G (n_freq, r, nu) and E_u (n_freq, r, nu)
-    moved: ComplexArray
-    own: ComplexArray | None
+    plant: StandardPlant
+    observer: StateSpace | None
+    reading: Reading
     #: of the modes: frequencies [Hz] and damping ratios
     modes: FloatArray
     damping: FloatArray
-    plant: StandardPlant
-    #: of the axes with a reference, their numbers and channels
-    referred: Mapping[int, str]
 
     @cached_property
     def motion(self) -> ComplexArray:
         """From u to the axes with a reference (n_freq, k, nu): their true motion."""
-        chosen = self.plant.system.select(list(self.referred.values()), self.plant.u)
-        return _stack(chosen, self.freq)
+        return _stack(self.plant.system, self.reading.references, self.plant.u, self.freq)
 
-    @cached_property
+    @property
     def through(self) -> ComplexArray:
         """From u to what the servo reads, with all paths."""
-        return self.moved if self.own is None else self.moved + self.own
+        return self._paths[0]
+
+    @property
+    def own(self) -> ComplexArray | None:
+        """From u to what the servo reads, within an observer that reads u."""
+        return self._paths[1]
+
+    @cached_property
+    def _paths(self) -> tuple[ComplexArray, ComplexArray | None]:
+        """E_y G + E_u and E_u (n_freq, r, nu)."""
+        plant, observer, reading, grid = self.plant, self.observer, self.reading, self.freq
+        direct = [one for one in reading.channels if observer is None or reading.reads[one] == one]
+        rows = {name: i for i, name in enumerate(reading.channels)}
+        through = np.zeros((grid.size, len(rows), len(plant.u)), dtype=np.complex128)
+        if direct:
+            known = _stack(plant.system, direct, plant.u, grid)
+            through[:, [rows[name] for name in direct]] = known
+        guessed = [name for name in reading.channels if name not in direct]
+        if not guessed or observer is None:
+            return through, None
+        read, given = (
+            [name for name in observer.inputs if name in side] for side in (plant.y, plant.u)
+        )
+        at, hats = [rows[name] for name in guessed], [reading.reads[name] for name in guessed]
+        E = _stack(observer, hats, [*read, *given], grid)
+        through[:, at] = E[..., : len(read)] @ _stack(plant.system, read, plant.u, grid)
+        if not given:
+            return through, None
+        own = np.zeros_like(through)
+        columns = [plant.u.index(name) for name in given]
+        own[np.ix_(range(grid.size), at, columns)] = E[..., len(read) :]
+        return through + own, own
 
     @cached_property
     def mixed(self) -> bool:
@@ -280,8 +332,30 @@ class ServoLoop:
         self, law: ServoLaw, some: IntArray | slice = slice(None)
     ) -> tuple[ComplexArray, ComplexArray | None]:
         """Return L (k, nu, nu) with all paths, and the inner loop of the observer's u."""
-        act = -law.driven.T * self.at(law)[some, None, :]
-        return act @ self.through[some], None if self.own is None else act @ self.own[some]
+        at, alike = self.at(law)[some], tuple(map(law.axes.index, law.axes))
+        loop, *inner = (
+            np.asarray(sum(at[:, i, None, None] * part[some] for i, part in parts))
+            for parts in self._acting(law.driven, law.level, alike)
+        )
+        return loop, inner[0] if inner else None
+
+    @cached_property
+    def _acting(self) -> Callable[..., list[list[tuple[int, ComplexArray]]]]:
+        """The function of axes that gives what the first of each equal law multiplies in a loop."""
+
+        @lru_cache(maxsize=_KEPT)
+        def found(
+            driven: DrivenAxes, level: tuple[float, ...], alike: tuple[int, ...]
+        ) -> list[list[tuple[int, ComplexArray]]]:
+            groups = {i: np.flatnonzero(np.equal(alike, i)) for i in set(alike)}
+            T = -driven.T / level
+            return [
+                [(i, level[i] * T[:, own] @ paths[:, own]) for i, own in groups.items()]
+                for paths in self._paths
+                if paths is not None
+            ]
+
+        return found
 
     def _sizes(self, law: ServoLaw, some: IntArray) -> FloatArray:
         loop = self.broken(law, some)
@@ -343,7 +417,8 @@ class ServoLoop:
         """Return the least frequency [Hz] at which |S| of a reference first crosses 1."""
         T, L = law.driven.T, self.broken(law)[0]
         moved = np.linalg.solve(np.eye(len(T)) - L, T * self.at(law)[:, None, :])
-        error = 1.0 - np.einsum("fij,fji->if", self.motion, moved[:, :, list(self.referred)])
+        referred = [self.reading.channels.index(name) for name in self.reading.references]
+        error = 1.0 - np.einsum("fij,fji->if", self.motion, moved[:, :, referred])
         return _first_crossing(self.freq, np.abs(error))
 
     def _at_least(self, law: ServoLaw, like: ServoLaw) -> float:
@@ -387,11 +462,14 @@ class ServoLoop:
         ends = np.searchsorted(self.freq, [0.98 * self.modes, 1.02 * self.modes])
         return [slice(*pair) for pair in ends.T.tolist()]
 
+    @cached_property
+    def _reach(self) -> Callable[[DrivenAxes], FloatArray]:
+        """The function of axes that gives the size of T times what u moves."""
+        return lru_cache(lambda axes: np.linalg.norm(axes.T @ self.through, axis=(1, 2)))
+
     def resonant(self, law: ServoLaw) -> list[int]:
         """Return the modes above the bandwidth with loop gain and no notch, the largest first."""
-        size = np.abs(self.at(law)).max(axis=1) * np.linalg.norm(
-            law.driven.T @ self.through, axis=(1, 2)
-        )
+        size = np.abs(self.at(law)).max(axis=1) * self._reach(law.driven)
         peaks = np.array([size[near].max(initial=0.0) for near in self._near])
         # below the bandwidths a notch would take the gain that suppresses the error
         peaks[self.modes < law.driven.freq.min()] = 0.0
@@ -445,31 +523,6 @@ class ServoLoop:
         return [modes[int(np.argmin(off[0]))]]
 
 
-@dataclass(frozen=True, eq=False)
-class Reading:
-    """What a servo reads for each axis: the estimate of a POI's, or the sensor itself."""
-
-    channels: tuple[str, ...]
-    #: of the channel: its estimate or sensor, and its reference where there is one
-    reads: Mapping[str, str]
-    references: Mapping[str, str]
-
-    @property
-    def estimates(self) -> list[str]:
-        """What an observer has to give."""
-        return [one for channel, one in self.reads.items() if one != channel]
-
-    def warn_of_held(self, axes: Sequence[str] | None) -> None:
-        """Warn of sensors that stand for a motion that no POI shows, where axes are not given."""
-        held = [channel for channel, one in self.reads.items() if one == channel]
-        if axes is None and held and self.references:
-            warn(
-                "no axis of a POI shows a free motion that the actuators move, so that the servo "
-                f"holds {', '.join(held)} at zero, also while references move the POIs. Add a Poi "
-                "that shows this motion to move otherwise, or name the axes, axes=[...]."
-            )
-
-
 @lru_cache(maxsize=_KEPT)
 def reading_of(plant: StandardPlant, channels: tuple[str, ...]) -> Reading:
     """Return what a servo on some channels reads."""
@@ -496,40 +549,19 @@ def servo_loop(
     grid = resonance_grid(poles, plant.dt, points=300)
     # half the rate itself, where a hold has no answer, is left out
     grid = grid[grid < 0.5 / plant.dt * (1.0 - 1e-6)]
-    return loop_over(grid, plant, observer, reading, known)
+    return ServoLoop(grid, plant, observer, reading, *oscillations(known))
 
 
-def loop_over(
-    grid: FloatArray,
-    plant: StandardPlant,
-    observer: StateSpace | None,
-    reading: Reading,
-    known: StandardPlant,
-) -> ServoLoop:
-    """Return the loop on a grid of frequencies [Hz]: see `servo_loop`."""
-    direct = [one for one in reading.channels if observer is None or reading.reads[one] == one]
-    rows = {name: i for i, name in enumerate(reading.channels)}
-    moved = np.zeros((grid.size, len(rows), len(plant.u)), dtype=np.complex128)
-    own, given = np.zeros_like(moved), []
-    if direct:
-        moved[:, [rows[n] for n in direct]] = _stack(plant.system.select(direct, plant.u), grid)
-    guessed = [name for name in reading.channels if name not in direct]
-    if guessed and observer is not None:
-        read, given = (
-            [name for name in observer.inputs if name in side] for side in (plant.y, plant.u)
-        )
-        hats = [reading.reads[name] for name in guessed]
-        E = _stack(observer.select(hats, [*read, *given]), grid)
-        at = [rows[name] for name in guessed]
-        moved[:, at] = E[..., : len(read)] @ _stack(plant.system.select(read, plant.u), grid)
-        columns = [plant.u.index(name) for name in given]
-        own[np.ix_(range(grid.size), at, columns)] = E[..., len(read) :]
-    referred = {rows[name]: name for name in reading.references}
-    return ServoLoop(grid, moved, own if given else None, *oscillations(known), plant, referred)
+def _stack(
+    system: StateSpace, outputs: Iterable[str], inputs: Iterable[str], grid: FloatArray
+) -> ComplexArray:
+    found = responses(_part(system, tuple(outputs), tuple(inputs)), grid)
+    return np.ascontiguousarray(np.moveaxis(found, -1, 0))
 
 
-def _stack(system: StateSpace, grid: FloatArray) -> ComplexArray:
-    return np.ascontiguousarray(np.moveaxis(responses(system, grid), -1, 0))
+@lru_cache(maxsize=2 * _KEPT)
+def _part(system: StateSpace, outputs: tuple[str, ...], inputs: tuple[str, ...]) -> StateSpace:
+    return system.select(outputs, inputs)
 
 
 def path_of(plant: StandardPlant, observer: StateSpace | None, reading: Reading) -> StateSpace:
