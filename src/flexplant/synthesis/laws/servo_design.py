@@ -323,8 +323,8 @@ class ServoTask:
                     f"bandwidth {f:g} Hz is not well below the rate, {self.rate:g} Hz: the law "
                     f"needs room above it. Stay below {0.2 * self.rate:g} Hz, or raise the rate."
                 )
-        exact, smooth = np.abs(gains_at(self.plant, driven)), (2.0 * np.pi * driven.freq) ** -2.0
-        lines = combinations(lines_of(self.plant, driven))
+        gains, smooth = gains_at(self.plant, driven), (2.0 * np.pi * driven.freq) ** -2.0
+        exact, lines = np.abs(gains), combinations(lines_of(self.plant, driven, gains))
         best, modes = self._law(self._plain(driven, exact, lines)), elastic(self.plant)[:, None]
         # next to a resonance the response says little of the axis: that on the real axis does
         near = np.any(np.abs(np.log(modes / driven.freq)) < _RESONANT, axis=0)

@@ -8,7 +8,6 @@ from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from ...arrays import ComplexArray, FloatArray, IntArray
 from ...errors import LabelError, warn
@@ -155,9 +154,9 @@ def gains_at(
     return np.array([gains[s][i] @ axes.T[:, i] for i, s in enumerate(at)])
 
 
-def lines_of(plant: StandardPlant, axes: DrivenAxes) -> list[tuple[str, ...]]:
-    """Return the lines on which each axis may lie, the most likely first."""
-    phases = np.angle(gains_at(plant, axes)) + np.pi * axes.freq * plant.dt * (1 + 2 * plant.delay)
+def lines_of(plant: StandardPlant, axes: DrivenAxes, gains: ComplexArray) -> list[tuple[str, ...]]:
+    """Return the lines on which each axis with a gain may lie, the most likely first."""
+    phases = np.angle(gains) + np.pi * axes.freq * plant.dt * (1 + 2 * plant.delay)
     steps = np.array([_BELOW, 1.0 / _STEP, 1.0, _STEP])[:, None]
     real = [gains_at(plant, axes, np.asarray(one)) for one in -1j * steps * axes.freq]
     rest, below, there, above = np.abs(np.real(real))
@@ -286,16 +285,6 @@ class ServoLoop:
         """From u to the axes with a reference (n_freq, k, nu): their true motion."""
         return _stack(self.plant.system, self.reading.references, self.plant.u, self.freq)
 
-    @property
-    def through(self) -> ComplexArray:
-        """From u to what the servo reads, with all paths."""
-        return self._paths[0]
-
-    @property
-    def own(self) -> ComplexArray | None:
-        """From u to what the servo reads, within an observer that reads u."""
-        return self._paths[1]
-
     @cached_property
     def _paths(self) -> tuple[ComplexArray, ComplexArray | None]:
         """E_y G + E_u and E_u (n_freq, r, nu)."""
@@ -332,48 +321,12 @@ class ServoLoop:
         self, law: ServoLaw, some: IntArray | slice = slice(None)
     ) -> tuple[ComplexArray, ComplexArray | None]:
         """Return L (k, nu, nu) with all paths, and the inner loop of the observer's u."""
-        at, alike = self.at(law)[some], tuple(map(law.axes.index, law.axes))
-        loop, *inner = (
-            np.asarray(sum(at[:, i, None, None] * part[some] for i, part in parts))
-            for parts in self._acting(law.driven, law.level, alike)
-        )
-        return loop, inner[0] if inner else None
+        act, (through, own) = -law.driven.T * self.at(law)[some, None, :], self._paths
+        return act @ through[some], None if own is None else act @ own[some]
 
-    @cached_property
-    def _acting(self) -> Callable[..., list[list[tuple[int, ComplexArray]]]]:
-        """The function of axes that gives what the first of each equal law multiplies in a loop."""
-
-        @lru_cache(maxsize=_KEPT)
-        def found(
-            driven: DrivenAxes, level: tuple[float, ...], alike: tuple[int, ...]
-        ) -> list[list[tuple[int, ComplexArray]]]:
-            groups = {i: np.flatnonzero(np.equal(alike, i)) for i in set(alike)}
-            T = -driven.T / level
-            return [
-                [(i, level[i] * T[:, own] @ paths[:, own]) for i, own in groups.items()]
-                for paths in self._paths
-                if paths is not None
-            ]
-
-        return found
-
-    def _sizes(self, law: ServoLaw, some: IntArray) -> FloatArray:
+    def _sizes(self, law: ServoLaw, some: IntArray | slice = slice(None)) -> FloatArray:
         loop = self.broken(law, some)
         return peaking_size(sensitivity(*loop)) if self.mixed else sensitivity_size(*loop)
-
-    @cached_property
-    def _may_peak(self) -> Callable[[ServoLaw], npt.NDArray[np.bool_]]:
-        """The function of a law that says at which points sigma_max(S_u) may be 1 or more."""
-        # with q and k the norms of L^-1 and of L^-1 times the inner loop it is at most
-        # (q + k) / (1 - q). L^-1 is a sum over the axes, each a column times a row
-        through, own = self.through, self.own
-        if through.shape[1] < through.shape[2]:
-            return lambda law: np.ones(self.freq.size, dtype=bool)
-        inverse = np.linalg.inv(through)
-        columns = np.linalg.norm(inverse, axis=1)
-        k = 0.0 if own is None else np.linalg.norm(inverse @ own, axis=(1, 2))
-        rows = lru_cache(lambda axes: np.linalg.norm(np.linalg.inv(axes.T), axis=1))
-        return lambda law: 2.0 * (columns / np.abs(self.at(law))) @ rows(law.driven) + k >= 1.0
 
     @cached_property
     def at(self) -> Callable[[ServoLaw], ComplexArray]:
@@ -398,14 +351,7 @@ class ServoLoop:
 
         It is a lower bound where it is not the largest. It says nothing of stability: check that.
         """
-
-        @lru_cache
-        def found(law: ServoLaw) -> FloatArray:
-            size, may = np.zeros(self.freq.size), np.flatnonzero(self._may_peak(law))
-            size[may] = self._sizes(law, may)
-            return size
-
-        return found
+        return lru_cache(self._sizes)
 
     def peak(self, law: ServoLaw) -> tuple[float, float]:
         """Return max_f sigma_max(S_u) over the grid and its frequency [Hz]."""
@@ -465,7 +411,7 @@ class ServoLoop:
     @cached_property
     def _reach(self) -> Callable[[DrivenAxes], FloatArray]:
         """The function of axes that gives the size of T times what u moves."""
-        return lru_cache(lambda axes: np.linalg.norm(axes.T @ self.through, axis=(1, 2)))
+        return lru_cache(lambda axes: np.linalg.norm(axes.T @ self._paths[0], axis=(1, 2)))
 
     def resonant(self, law: ServoLaw) -> list[int]:
         """Return the modes above the bandwidth with loop gain and no notch, the largest first."""
