@@ -16,6 +16,7 @@ from ..lti.measured_lines import FEWEST, HiddenModes, MeasuredPlant
 from ..lti.response_solvers import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant
+from ..plant.axes import KEPT
 from ..tolerances import CLOSE, MOST_STEPS, NULL, RANK, TINY, TYPED
 from ..words import instance
 from .blocks import references
@@ -27,8 +28,6 @@ _SMALL = 0.5
 _NEAR = 0.8
 #: logarithmic step of a grid that is refined at the peaks of |S|
 _POINTS = 100
-#: cache of prepared plants, which loops with other controllers use again
-_KEPT = 8
 
 
 @dataclass(frozen=True)
@@ -235,7 +234,7 @@ class Path(NamedTuple):
     respond: Responder
 
 
-@lru_cache(maxsize=_KEPT)
+@lru_cache(maxsize=KEPT)
 def plant_path(plant: AnyPlant, driven: tuple[str, ...]) -> Path:
     """Return the path between some actuators and y."""
     system = plant.system.select(plant.y, driven)
@@ -388,12 +387,16 @@ def error_sensitivity(
 
 def axis_sensitivities(loop: Any) -> dict[str, tuple[FloatArray, FloatArray]]:
     """Return |S| of each axis that has a reference, by its name: frequencies [Hz] and sizes."""
-    pairs = {name: f"{name.removesuffix(':ref')}:error" for name in references(loop.plant)}
     return {
         error.removesuffix(":error"): error_sensitivity(loop, ref, error)
-        for ref, error in pairs.items()
-        if error in loop.plant.z
+        for ref, error in reference_pairs(loop.plant).items()
     }
+
+
+def reference_pairs(plant: AnyPlant) -> dict[str, str]:
+    """Return the error of each reference that has one in z."""
+    pairs = {name: f"{name.removesuffix(':ref')}:error" for name in references(plant)}
+    return {name: error for name, error in pairs.items() if error in plant.z}
 
 
 def first_crossing(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
@@ -12,15 +12,23 @@ import numpy as np
 from ...arrays import ComplexArray, FloatArray, IntArray
 from ...errors import LabelError, warn
 from ...loop import ClosedLoop
-from ...loop.blocks import as_block, references
-from ...loop.broken import least_scaled, mixed_units, peaking_size, sensitivity, sensitivity_size
+from ...loop.blocks import as_block
+from ...loop.broken import (
+    first_crossing,
+    least_scaled,
+    mixed_units,
+    peaking_size,
+    reference_pairs,
+    sensitivity,
+    sensitivity_size,
+)
 from ...lti.blocks_of_states import Matrices, cascaded
 from ...lti.frequency_sweep import resonance_grid
 from ...lti.interconnection import connect
 from ...lti.response_solvers import responses
 from ...lti.statespace import StateSpace
 from ...plant import EvaluationModel, Foreign, StandardPlant
-from ...plant.axes import DrivenAxes, complex_gain, force_units, oscillations
+from ...plant.axes import KEPT, DrivenAxes, complex_gain, force_units, oscillations
 from .controller_elements import Integrator, LowPass, Notch, Pid
 from .law import Law, decoupled, product, tustin_s
 
@@ -28,27 +36,17 @@ from .law import Law, decoupled, product, tustin_s
 #: |S| of a free mass peaks near 4 dB with the roll-off and integrator of `design_servo`. Where a
 #: mode lies just above the bandwidth its notch takes phase, which wider leads give back
 LEADS = (4.0, 16.0, 64.0)
-
-
 #: highest corner of a law, as a fraction of the rate
 HIGHEST = 0.4
-
-
 #: lines on which an axis may lie, by the power of 1 / s of its response: a mass that is free (or
 #: above its springs), a damper, a spring (or a mass below its springs' frequency)
 POWERS = {"mass": 2.0, "damper": 1.0, "spring": 0.0}
-
-
 #: a line is tried when slope and phase of the response are at most this much further from it than
 #: from the nearest line; both distances are counted in powers of s
 _ASIDE = 0.8
-
-
 #: step of frequency for the slope, and how far below the bandwidth a response that vanishes at
 #: rest is sought, with how small it is there
 _STEP, _BELOW, _VANISHED = 1.05, 1e-3, 1e-2
-
-
 #: |S| at u that a notch is to bring the loop below: 6 dB
 TARGET = 2.0
 #: notches that are placed at most, modes that are tried for each, and the least gain of one
@@ -65,13 +63,6 @@ _DRIVEN = 0.3
 _QUIET = 0.3
 
 
-#: |S| relative to what is asked from which on the next bandwidth is not tried
-FAR = 3.0
-#: loops of this number of plants are kept: their designs at other bandwidths begin with them; and
-#: laws of this number of axes
-_KEPT = 8
-
-
 @dataclass(frozen=True, eq=False)
 class Axis:
     """The law of an axis, sampled by Tustin's rule, of gain 1 at the bandwidth.
@@ -84,9 +75,9 @@ class Axis:
     line: str
     bandwidth: float
     rolloff: float
-    integrator: float
     rate: float
     lead: float
+    integrator: float
 
     def law(self, notches: Sequence[Notch]) -> Law:
         """Return the law with notches, from error to command."""
@@ -106,11 +97,6 @@ class Axis:
         """The response of the shape at the bandwidth, of size 1."""
         return complex(self.shape.at(np.array(self.bandwidth)))
 
-    def faster(self, part: float) -> Axis:
-        """Return the law with integral action up to a part of the bandwidth, or faster."""
-        corner = max(self.integrator, part * self.bandwidth)
-        return known_axis(self.line, self.bandwidth, self.rolloff, corner, self.rate, self.lead)
-
     @property
     def action(self) -> tuple[Pid | Integrator, ...]:
         """Integral action and lead."""
@@ -124,10 +110,10 @@ class Axis:
 
 
 #: equal laws are one, so that what is known of it is found at once
-known_axis = lru_cache(maxsize=_NOTCHES * _KEPT)(Axis)
+known_axis = lru_cache(maxsize=_NOTCHES * KEPT)(Axis)
 
 
-@lru_cache(maxsize=_NOTCHES * _KEPT)
+@lru_cache(maxsize=_NOTCHES * KEPT)
 def _series(shape: Law, notches: tuple[Notch, ...]) -> Matrices:
     """Return A, B, C and D of a law and notches, sampled."""
     if not notches:
@@ -135,12 +121,12 @@ def _series(shape: Law, notches: tuple[Notch, ...]) -> Matrices:
     return cascaded(_series(shape, notches[:-1]), _sampled(notches[-1], shape.rate))
 
 
-@lru_cache(maxsize=_NOTCHES * _KEPT)
+@lru_cache(maxsize=_NOTCHES * KEPT)
 def _notch(freq: float, depth: float, width: float) -> Notch:
     return Notch(freq, depth, width)
 
 
-@lru_cache(maxsize=_NOTCHES * _KEPT)
+@lru_cache(maxsize=_NOTCHES * KEPT)
 def _sampled(notch: Notch, rate: float) -> Matrices:
     return notch.sampled(rate).matrices
 
@@ -154,9 +140,9 @@ def gains_at(
     return np.array([gains[s][i] @ axes.T[:, i] for i, s in enumerate(at)])
 
 
-def lines_of(plant: StandardPlant, axes: DrivenAxes, gains: ComplexArray) -> list[tuple[str, ...]]:
-    """Return the lines on which each axis with a gain may lie, the most likely first."""
-    phases = np.angle(gains) + np.pi * axes.freq * plant.dt * (1 + 2 * plant.delay)
+def lines_of(plant: StandardPlant, axes: DrivenAxes) -> list[tuple[str, ...]]:
+    """Return the lines on which each axis may lie, the most likely first."""
+    phases = np.angle(gains_at(plant, axes)) + np.pi * axes.freq * plant.dt * (1 + 2 * plant.delay)
     steps = np.array([_BELOW, 1.0 / _STEP, 1.0, _STEP])[:, None]
     real = [gains_at(plant, axes, np.asarray(one)) for one in -1j * steps * axes.freq]
     rest, below, there, above = np.abs(np.real(real))
@@ -210,12 +196,14 @@ class ServoLaw(NamedTuple):
         """Return the same with other axes."""
         return self._replace(axes=tuple(axes))
 
-    def gains(self, notch: Notch) -> FloatArray:
-        """Return the gains (r,) of a notch at the bandwidths, which the laws make up for."""
-        return np.abs(self.there(notch))
+    def faster(self, part: float) -> ServoLaw:
+        """Return the same with integral action up to a part of the bandwidth, or faster."""
+        corners = (max(one.integrator, part * one.bandwidth) for one in self.axes)
+        each = zip(self.axes, corners, strict=True)
+        return self.of(known_axis(*astuple(one)[:-1], corner) for one, corner in each)
 
     def there(self, notch: Notch) -> ComplexArray:
-        """Return the responses (r,) of a notch at the bandwidths."""
+        """Return the responses (r,) of a notch at the bandwidths, whose gains the laws make up."""
         rate = self.axes[0].rate
         s = tustin_s(np.array([axis.bandwidth for axis in self.axes]), rate)
         return notch.section.at(rate).gain(s)
@@ -225,13 +213,15 @@ class ServoLaw(NamedTuple):
         found, rate = {one: one.shape.at(freq) for one in set(self.axes)}, self.axes[0].rate
         at = np.stack([found[one] for one in self.axes], axis=-1) / self.level
         for notch in self.notches:
-            at *= notch.section.at(rate).gain(tustin_s(freq, rate))[:, None] / self.gains(notch)
+            at *= notch.section.at(rate).gain(tustin_s(freq, rate))[:, None] / np.abs(
+                self.there(notch)
+            )
         return at
 
     @property
     def matrices(self) -> Matrices:
         """A, B, C and D from what the servo reads to the actuators."""
-        notched = np.prod([self.gains(notch) for notch in self.notches], axis=0)
+        notched = np.abs(np.prod([self.there(notch) for notch in self.notches], axis=0))
         parts = []
         for axis, gain in zip(self.axes, notched * np.array(self.level), strict=True):
             A, B, C, D = _series(axis.shape, self.notches)
@@ -341,7 +331,7 @@ class ServoLoop:
                 return law.at(self.freq)
             *first, last = law.notches
             before = found(law._replace(notches=tuple(first)))
-            return np.asarray(before * (notched(last) / law.gains(last)))
+            return np.asarray(before * (notched(last) / np.abs(law.there(last))))
 
         return found
 
@@ -469,7 +459,7 @@ class ServoLoop:
         return [modes[int(np.argmin(off[0]))]]
 
 
-@lru_cache(maxsize=_KEPT)
+@lru_cache(maxsize=KEPT)
 def reading_of(plant: StandardPlant, channels: tuple[str, ...]) -> Reading:
     """Return what a servo on some channels reads."""
     ports = {poi.channel(axis): (poi, axis) for poi in plant.assembled.ports.z for axis in poi.axes}
@@ -484,7 +474,7 @@ def reading_of(plant: StandardPlant, channels: tuple[str, ...]) -> Reading:
     )
 
 
-@lru_cache(maxsize=_KEPT)
+@lru_cache(maxsize=KEPT)
 def servo_loop(
     plant: StandardPlant, observer: StateSpace | None, reading: Reading, known: StandardPlant
 ) -> ServoLoop:
@@ -505,7 +495,7 @@ def _stack(
     return np.ascontiguousarray(np.moveaxis(found, -1, 0))
 
 
-@lru_cache(maxsize=2 * _KEPT)
+@lru_cache(maxsize=2 * KEPT)
 def _part(system: StateSpace, outputs: tuple[str, ...], inputs: tuple[str, ...]) -> StateSpace:
     return system.select(outputs, inputs)
 
@@ -519,7 +509,7 @@ def path_of(plant: StandardPlant, observer: StateSpace | None, reading: Reading)
     return connect([plant.system.select(read, plant.u), observer], plant.u, reads)
 
 
-@lru_cache(maxsize=_KEPT)
+@lru_cache(maxsize=KEPT)
 def seeing(plant: StandardPlant, reading: Reading) -> StandardPlant:
     """Return the plant whose y are the references and the axes themselves, named as read."""
     g, nz = plant.system, len(plant.z)
@@ -557,46 +547,40 @@ def observer_system(
     return inner
 
 
-def highest_bandwidth(freq: Sequence[float], excess: Callable[[float], float]) -> float | None:
+def highest_bandwidth(freq: Sequence[float], holds: Callable[[float], bool | None]) -> float | None:
     """Return the largest frequency that holds: of a descending grid, then by bisection above.
 
-    An excess of at most 1 holds. After a large one the next frequency is left out, and tried only
-    if no other holds.
+    After an unstable one, None, the next is left out, and tried only if no other holds.
     """
     i, above, left = 0, 0, []
-    while i < len(freq) and (size := excess(freq[i])) > 1.0:
-        left += [i + 1] if size > FAR else []
-        above, i = i, i + (2 if size > FAR else 1)
+    while i < len(freq) and not (held := holds(freq[i])):
+        left += [i + 1] if held is None else []
+        above, i = i, i + (2 if held is None else 1)
     if i >= len(freq):
-        i = next((one for one in left if one < len(freq) and excess(freq[one]) <= 1.0), i)
+        i = next((one for one in left if one < len(freq) and holds(freq[one])), i)
         above = i - 1
     if not 0 < i < len(freq):  # none, or the first
         return freq[0] if not i else None
     low, high = freq[i], freq[above]
     for _ in range(5 + i - above):
         middle = float(np.sqrt(low * high))
-        low, high = (middle, high) if excess(middle) <= 1.0 else (low, middle)
+        low, high = (middle, high) if holds(middle) else (low, middle)
     return low
 
 
 def suppressed_up_to(closed: ClosedLoop) -> float:
     """Return the least frequency [Hz] of a grid at which |S| of a reference first crosses 1."""
     plant = closed.plant
-    pairs = {name: f"{name.removesuffix(':ref')}:error" for name in references(plant)}
     response = closed.frequency_response(closed.broken.grid)
-    sizes = [
+    sizes = (
         np.abs(response.data[plant.z.index(error), plant.w.index(reference)])
-        for reference, error in pairs.items()
-        if error in plant.z
-    ]
+        for reference, error in reference_pairs(plant).items()
+    )
     return _first_crossing(response.freq, sizes)
 
 
 def _first_crossing(freq: FloatArray, sizes: Iterable[FloatArray]) -> float:
     """Return the least frequency [Hz] at which one of some sizes of |S| first crosses 1."""
-    found = []
-    for size in sizes:
-        below = np.logical_or.accumulate(size < 1.0)
-        above = np.flatnonzero((size >= 1.0) & (below | ~below[-1]))
-        found.append(float(freq[above[0] if above.size else -1]))
-    return min(found, default=0.0)
+    first, last = float(freq[0]), float(freq[-1])
+    crossings = (first_crossing(freq, one, None) if one.min() < 1.0 else first for one in sizes)
+    return min((min(one, last) for one in crossings), default=0.0)
