@@ -16,6 +16,7 @@ from flexplant.plant import Actuator, Disturbance, Poi, Ports, Reference, Sensor
 from flexplant.structure import FEModel, ModalDamping
 from flexplant.synthesis import design_servo, servo_bandwidth
 from flexplant.synthesis.laws.servo_design import servo_task
+from flexplant.synthesis.laws.servo_loops import highest_bandwidth, suppressed_up_to
 from flexplant.testbeds import three_masses, wafer_stage
 from oracles_plant import closed_loop
 from stages import RATE, block, calibrated, ports, reduced, sampled
@@ -202,9 +203,35 @@ def test_search_and_certificate_break_the_same_loop():
         task = servo_task(one, None, None, None, None, (), observer)
         for bandwidth in (5.0, 20.0):
             law = task.law(bandwidth)
-            found = sensitivity(*task.loop.broken(law.driven.T, law.at(task.loop.freq)))
+            found = sensitivity(*task.loop.broken(law))
             gain = task.closed(law).broken.gain(task.loop.freq)
             np.testing.assert_allclose(found @ (np.eye(gain.shape[1]) - gain), 1.0, rtol=1e-6)
+            # and |S| of the reference, by the closed loop from w to z
+            assert task._suppressed_up_to(law) == pytest.approx(suppressed_up_to(task.closed(law)))
+
+
+def test_bandwidths_from_high_to_low_and_above_the_one_that_holds():
+    """A toy: it holds in bands, and is unstable (None) in others; the next is left out then."""
+    grid = np.geomspace(1000.0, 1.0, 31).tolist()
+
+    def found(holds):
+        asked = []
+        answer = highest_bandwidth(grid, lambda f: asked.append(f) or holds(f))
+        return answer, [f for f in asked if f in grid]
+
+    fine = (grid[0] / grid[1]) ** (1 / 64)
+    for edge in (7.3, 8.1, 500.0):  # the edge is found whether the point above it was left out
+        reach, asked = found(lambda f, edge=edge: True if f <= edge else None)
+        assert edge / fine <= reach <= edge and len(asked) <= 17
+        reach, asked = found(lambda f, edge=edge: f <= edge)
+        assert edge / fine <= reach <= edge and len(asked) > 17 * (edge < 10.0)
+    assert found(lambda f: True) == (grid[0], grid[:1])
+    # a band of one point between unstable loops is left out where another holds, found where none
+    for odd in (8, 9):
+        alone = found(lambda f, odd=odd: True if f == grid[odd] else None)[0]
+        assert alone == grid[odd]
+    none, asked = found(lambda f: None)
+    assert none is None and sorted(asked, reverse=True) == grid
 
 
 @pytest.mark.long
