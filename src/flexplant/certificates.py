@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -81,10 +81,23 @@ class Certificate(Value, Mapping[str, float]):
     (0.9601, True)
     """
 
-    checks: tuple[Verified, ...] = ()
+    checks: tuple[Verified, ...] = field(default_factory=tuple)
 
     def __post_init__(self) -> None:
-        self._set(checks=tuple({check.what: check for check in self.checks}.values()))
+        self._set_checks(self.checks)
+
+    def _set_checks(self, checks: Iterable[Verified]) -> None:
+        self._set(checks=tuple({check.what: check for check in checks}.values()))
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            """Compute the checks of `deferred` where they are first read."""
+            if name != "checks":
+                return super().__getattr__(name)
+            self._set_checks(self._computed())
+            self.__dict__.pop("_computed", None)  # with all that it holds
+            return self.checks
 
     @property
     def holds(self) -> bool:
@@ -105,16 +118,25 @@ class Certificate(Value, Mapping[str, float]):
 
     def __or__(self, other: Certificate) -> Certificate:
         """Return the checks of both; those of `other` replace checks of the same name."""
-        return self.extended(*other.checks) if isinstance(other, Certificate) else NotImplemented
+        if not isinstance(other, Certificate):
+            return NotImplemented
+        return deferred(lambda: (*self.checks, *other.checks))
 
     def extended(self, *checks: Verified) -> Certificate:
         """Return the certificate with further checks. They replace checks of the same name."""
-        return Certificate((*self.checks, *checks))
+        return deferred(lambda: (*self.checks, *checks))
 
     def __repr__(self) -> str:
         """Return a table of the checks."""
         lines = aligned(["checked", "figure", "limit", "route"], (c.row for c in self.checks))
         return "\n".join(["<Certificate", *(f"  {line}" for line in lines)]) + ">"
+
+
+def deferred(computed: Callable[[], Iterable[Verified]]) -> Certificate:
+    """Return a certificate whose checks are computed when they are first read, copied or saved."""
+    found = object.__new__(Certificate)
+    object.__setattr__(found, "_computed", computed)
+    return found
 
 
 def stability_name(sampled: Any) -> str:

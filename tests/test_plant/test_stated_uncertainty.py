@@ -7,7 +7,15 @@ import pytest
 
 import flexplant as fx
 from flexplant.errors import LabelError, ModelError
-from flexplant.plant import Dampings, Delay, Frequencies, Gains, Parameters, Shapes
+from flexplant.plant import (
+    Dampings,
+    Delay,
+    Frequencies,
+    Gains,
+    Parameters,
+    Shapes,
+    UnmodelledDynamics,
+)
 from stages import sampled, some_modes
 
 
@@ -298,3 +306,36 @@ def test_the_gain_of_an_actuator_behind_its_own_filter(rate, amplifier):
         fx.frequency_response(wanted.system, freq).data,
         rtol=1e-12,
     )
+
+
+@pytest.mark.parametrize("rate", [0.0, 5e3])
+@pytest.mark.parametrize(
+    "kinds",
+    [
+        [Frequencies(0.01), Dampings(0.3)],
+        [Frequencies(0.01), Gains({"u1": 0.1, "y1": 0.05})],
+        [Gains({"u1": 0.1})],
+    ],
+)
+def test_what_loops_feed_back_is_that_of_the_machines_drawn(kinds, rate):
+    """The same random numbers; without motions of POIs and without noise of the samples."""
+    own = plant().continuous
+    uncertain = (own.discretized(rate, delay=1.3) if rate else own).uncertain(*kinds)
+    sensors = [name for name in own.y if name not in own.w]
+    machines = uncertain.machines
+    bare, full = machines.each(3, rng=5, fed_back=True), machines.drawn(3, rng=5)
+    for one, whole in zip(bare, full, strict=True):
+        assert (tuple(one.y), one.dt, one.delay) == (tuple(sensors), whole.dt, whole.delay)
+        given, known = (each.system.select(sensors, own.u) for each in (one, whole))
+        assert given.states == known.states
+        for name in "ABCD":
+            np.testing.assert_allclose(getattr(given, name), getattr(known, name), rtol=1e-12)
+
+
+def test_a_machine_with_unmodelled_dynamics_keeps_all_its_channels():
+    weight = 0.1 * fx.lti.low_pass_filter(100.0)
+    known = plant().uncertain(UnmodelledDynamics(weight, at="u1"), frequency=0.01)
+    (one,) = known.machines.each(1, rng=2, fed_back=True)
+    (whole,) = known.machines.drawn(1, rng=2)
+    assert (one.w, one.z) == (whole.w, whole.z)
+    np.testing.assert_array_equal(one.system.A, whole.system.A)

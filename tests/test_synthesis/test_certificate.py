@@ -1,10 +1,14 @@
 """certified_norm: no wrong loop passes; the sweep finds what a dense grid finds."""
 
+import pickle
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import flexplant as fx
+from flexplant.certificates import Certificate, Verified, deferred
 from flexplant.errors import CertificateError
 from flexplant.lti import StateSpace, lft
 from flexplant.synthesis import controller as certificate
@@ -96,3 +100,36 @@ def test_the_sweep_agrees_with_a_dense_grid(seed, zeta, dt, delays):
         A[range(6, 6 + delays), range(6, 6 + delays)] = -1e3
     g = StateSpace(A, B, C, np.zeros((2, 2)), dt)
     assert swept_norm(g) == pytest.approx(brute_norm(A, B, C, g.D, dt), rel=5e-4)
+
+
+def test_a_deferred_certificate_is_computed_once_where_it_is_read(tmp_path):
+    """Not by what makes a value of it; by what shows, copies or saves one."""
+    count = []
+
+    def checks():
+        count.append(1)
+        yield from (Verified("norm", 1.0), Verified("norm", 2.0))
+
+    whole = {"norm": 2.0, "radius": 0.5, "rank": 3.0}
+    first = deferred(checks)
+    both = (first | Certificate((Verified("radius", 0.5),))).extended(Verified("rank", 3.0))
+    K = fx.synthesis.Controller(loop_parts()[1], "by hand", certificate=both).replace(gamma=2.0)
+    assert not count
+    assert "norm 2, radius 0.5000, rank 3" in repr(K)
+    assert (dict(K.certificate), dict(first), count) == (whole, {"norm": 2.0}, [1])
+    K.replace(certificate=deferred(checks)).save(tmp_path / "K.npz")
+    assert dict(fx.load(tmp_path / "K.npz").certificate) == {"norm": 2.0}
+    assert dict(pickle.loads(pickle.dumps(deferred(checks)))) == {"norm": 2.0}
+    assert len(count) == 3
+
+
+def test_a_deferred_certificate_that_fails_fails_each_time():
+    def checks():
+        raise CertificateError("two routes disagree")
+
+    later = deferred(checks)
+    for read in (dict, repr, len, pickle.dumps):
+        with pytest.raises(CertificateError, match="two routes"):
+            read(later)
+    with pytest.raises(AttributeError, match="check"):
+        _ = Certificate().check

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 import flexplant as fx
-from flexplant.errors import InfeasibleError, ModelError
+from flexplant.errors import CertificateError, InfeasibleError, ModelError
 from flexplant.modes import solve_modes
 from flexplant.structure import FEModel, ModalDamping
-from flexplant.synthesis.hinf import stage_design
+from flexplant.synthesis.hinf import hinf_design, hinf_riccati, stage_design
+from flexplant.synthesis.hinf.hinf_riccati import UncheckedRiccati
+from flexplant.synthesis.preparation import prepared
 from flexplant.synthesis.robustness.guarantees import _quick
 from judge import judged
 from plates import make_plate
@@ -159,6 +161,47 @@ def test_a_machine_that_fails_has_more_drawn(monkeypatch, sizes, margin, those):
     loop = SimpleNamespace(broken=SimpleNamespace(mixed=tuple))
     found = stage_design._margins(loop, sizes, 0.35)
     assert (found.margin, found.those) == (margin, those)
+
+
+def test_what_decides_on_no_design_is_computed_where_it_is_read(monkeypatch):
+    def fails(*_):
+        raise CertificateError("of no use")
+
+    monkeypatch.setattr(hinf_design, "tolerated", fails)
+    found = fx.design_stage(fx.testbeds.three_masses(), bandwidth=10.0)
+    assert 0.5 < found.lower < found.gamma < 0.7
+    with pytest.raises(CertificateError, match="of no use"):
+        _ = found.certificate["norm"]
+    monkeypatch.undo()
+    assert found.certificate["norm"] == found.gamma
+
+
+@pytest.mark.slow
+def test_a_design_whose_search_ends_at_its_bound_is_not_solved_again(monkeypatch):
+    """The solution at hand, with the norm of its loop, is what `Riccati` gives."""
+    uncertain = plant().uncertain(frequency=SHARE)
+    quick = fx.design_stage(uncertain, bandwidth=60.0)
+    monkeypatch.setattr(UncheckedRiccati, "proven", lambda *_: None)
+    again = fx.design_stage(uncertain, bandwidth=60.0)
+    assert quick.gamma == pytest.approx(again.gamma, rel=1e-5)
+    freq = np.geomspace(1.0, 2e3, 100)
+    one, other = (fx.frequency_response(K.system, freq).data for K in (quick, again))
+    np.testing.assert_allclose(one, other, atol=1e-3 * np.abs(other).max())
+
+
+def test_a_promise_that_is_not_kept_is_not_proven(monkeypatch):
+    """Neither a gamma that hangs on the search, nor one below the norm of its loop."""
+    P = prepared(weighted().system, weighted().u, weighted().y)
+    one = UncheckedRiccati()
+    found = one.solve(P)._replace(at_bound=True)
+    monkeypatch.setattr(hinf_riccati, "resonance_gain", lambda *_: 0.0)
+    kept = one.proven(P, found)
+    assert 0.99 * found.gamma < kept.gamma <= found.gamma
+    assert one.proven(P, found._replace(at_bound=False)) is None
+    monkeypatch.setattr(hinf_riccati, "_loop_norm", lambda *_: 1.01 * found.gamma)
+    assert one.proven(P, found) is None
+    monkeypatch.setattr(hinf_riccati, "resonance_gain", lambda *_: 1.01 * found.gamma)
+    assert one.proven(P, found) is None
 
 
 @pytest.mark.long

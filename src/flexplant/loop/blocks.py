@@ -218,6 +218,16 @@ def with_known(plant: AnyPlant, systems: Sequence[StateSpace]) -> AnyPlant:
     return plant.replace(system=system, w=w, y=y)
 
 
+def joined(
+    plant: AnyPlant, systems: Sequence[StateSpace], idle: tuple[str, ...] = ()
+) -> tuple[AnyPlant, StateSpace]:
+    """Return the plant with what blocks read, and the blocks as one controller of it, checked."""
+    plant = with_known(plant, systems)
+    driven, watched = drives(plant, systems, idle)
+    check_inputs(plant, systems)
+    return plant, driving_blocks(plant, systems, driven, watched)
+
+
 def tapped(
     plant: AnyPlant, driven: Sequence[str], watched: Sequence[str], units: Mapping[str, str]
 ) -> StateSpace:

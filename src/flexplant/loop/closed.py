@@ -24,7 +24,7 @@ from ..plant.uncertainty.uncertain_plants import UncertainPlant
 from ..store import Value
 from ..tolerances import INTERVAL
 from ..words import name_list
-from .blocks import as_block, check_inputs, commands, drives, driving_blocks, tapped, with_known
+from .blocks import as_block, commands, joined, tapped, with_known
 from .broken import BrokenLoop, Path, plant_path
 from .budget import (
     ErrorBudget,
@@ -151,8 +151,8 @@ class ClosedLoop(Value):
 
     @cached_property
     def _command(self) -> StateSpace:
-        """From y to the driven u."""
-        return self.controller.select(outputs=self.driven)
+        """From y to the driven u; a plant alone with its sensors has no references."""
+        return self.controller.select(outputs=self.driven, inputs=self.plant.y)
 
     @cached_property
     def _poles(self) -> ComplexArray:
@@ -570,10 +570,7 @@ def close_loop(
         )
     resting = name_list(idle, "idle actuators")
     require_known("actuator to leave idle", resting, plant.u)
-    plant = with_known(plant, systems)
-    driven, watched = drives(plant, systems, resting)
-    check_inputs(plant, systems)
-    controller = driving_blocks(plant, systems, driven, watched)
+    plant, controller = joined(plant, systems, resting)
     loop = ClosedLoop(plant, systems, controller, resting)
     found = loop.left_out
     if not loop.is_stable and loop.obstacle and loop.obstacle.reason.startswith("unstable"):

@@ -107,7 +107,8 @@ def continuous_poles(g: StateSpace) -> ComplexArray:
 def _solver(g: Subsystem) -> tuple[Solver, int, int]:
     """Return a solver, its number of frequencies together times states, and least parts of a grid.
 
-    The arrays of a part of a short grid are below 128 kB: no memory is fetched from the system.
+    The arrays of a part of a short grid are below 128 kB: no memory is fetched from the system. The
+    grid of modes among other states has no least number: the fixed cost of a part is larger there.
     """
     n, m = g.B.shape
     if g.blocks is None:
@@ -118,7 +119,7 @@ def _solver(g: Subsystem) -> tuple[Solver, int, int]:
         return _modal(g), *sizes
     if 2 * (end - first) < n:
         return dense_solver(g)
-    return _among_others(g, first, end, blocks), CACHED // (m + 2), PARTS
+    return _among_others(g, first, end, blocks), CACHED // (m + 2), 1
 
 
 def _modal(g: Subsystem) -> Solver:

@@ -401,6 +401,17 @@ def another_machine(plant: P, realisation: ModalRealisation, ports: Ports) -> P:
     return remade(plant, realisation, ports, judged)
 
 
+def noiseless(plant: P, realisation: ModalRealisation, ports: Ports, late: float) -> P:
+    """Return the plant of another machine without noise, delayed by `late` samples more."""
+    structure = structure_system(realisation, ports)
+    origin = Assembled(ports, realisation, with_filters(structure, realisation, ports))
+    if plant.dt:
+        delay = plant.delay + late
+        physical, _ = _held(origin, 1.0 / plant.dt, delay)
+        origin = origin.replace(physical=physical, delay=delay)
+    return wired(type(plant), origin, None)
+
+
 def at_rate(weight: StateSpace, name: str, dt: float) -> StateSpace:
     """Return a weight of sampling time dt; a continuous one is sampled (Tustin)."""
     if not weight.n_states:

@@ -19,7 +19,7 @@ from ..tolerances import INTERVAL
 from ..updating import FrfResidual
 from ..updating.machines import COUNT, Machines
 from ..words import in_unit, with_unit
-from .building import another_machine, sampled
+from .building import another_machine, noiseless, sampled
 from .forces import Actuator
 from .machine_draws import DrawnModes, MachineFamily, obstacle
 from .origins import MeasuredResponse
@@ -163,17 +163,26 @@ class MachineParts(Value):
 
     def assembled(self) -> Any:
         """Return the plant of the machine, with the sampling of the nominal plant."""
-        plant, realisation = self.plant, self.realisation
-        if self.model is not None:
-            with warnings.catch_warnings():  # the nominal plant has said in which form it is
-                warnings.simplefilter("ignore", FlexplantWarning)
-                realisation = plant_modes(self.model)
-        elif not np.array_equal(self.pairs, realisation.pairs):
-            realisation = realisation.replace(pairs=self.pairs)
+        plant, realisation = self.plant, self._modes
         if not self.late:
             return another_machine(plant, realisation, self.ports)
         fresh = another_machine(plant.continuous, realisation, self.ports)
         return sampled(fresh, 1.0 / plant.dt, plant.delay + self.late)
+
+    def fed_back(self) -> Any:
+        """Return the same for a loop that reads sensors alone: no motions of POIs, no noise."""
+        ports = self.ports.replace(z=(), references=())
+        return noiseless(self.plant, self._modes, ports, self.late)
+
+    @property
+    def _modes(self) -> ModalRealisation:
+        if self.model is not None:
+            with warnings.catch_warnings():  # the nominal plant has said in which form it is
+                warnings.simplefilter("ignore", FlexplantWarning)
+                return plant_modes(self.model)
+        if np.array_equal(self.pairs, self.realisation.pairs):
+            return self.realisation
+        return self.realisation.replace(pairs=self.pairs)
 
 
 class PlantMachines:
@@ -244,14 +253,15 @@ class PlantMachines:
         """
         return list(self.each(count, rng=rng))
 
-    def each(self, count: int, *, rng: Rng) -> Iterator[Any]:
-        """Yield the machines of `drawn` one after the other."""
+    def each(self, count: int, *, rng: Rng, fed_back: bool = False) -> Iterator[Any]:
+        """Yield the machines of `drawn` one after the other, or only what loops feed back."""
+        uncertain = self.plant.uncertainty
+        blocks = uncertain is not None and bool(uncertain.delta_blocks)  # these may be of any port
         seeds = generator(rng).spawn(whole(count, "count", maximum=MOST_DRAWS))
         for i, own in enumerate(seeds, 1):
             try:
-                machine = self._machine(own)
-                uncertain = self.plant.uncertainty
-                if uncertain is not None and uncertain.delta_blocks:
+                machine = self._machine(own, fed_back and not blocks)
+                if blocks:
                     machine = uncertain.with_drawn_blocks(machine, own)
             except ModelError as error:
                 raise ModelError(
@@ -260,7 +270,7 @@ class PlantMachines:
                 ) from None
             yield machine
 
-    def _machine(self, rng: np.random.Generator) -> Any:
+    def _machine(self, rng: np.random.Generator, fed_back: bool) -> Any:
         """Return one machine: its modes drawn together, then all else that is stated."""
         uncertain, (apart,) = self.plant.uncertainty, rng.spawn(1)
         drawn = [] if uncertain is None else uncertain.values(apart)
@@ -277,13 +287,14 @@ class PlantMachines:
                 louder = float(np.exp(off * apart.standard_normal()))
                 machine = machine.with_port(port.replace(asd=louder * port.asd))
         machine = machine.changed(others)
+        modes: ModalRealisation | None = None
         if self.fit is not None:
             modes = self._of_fit(rng)
         elif of_modes:
             modes = uncertain.drawn_modes(machine.realisation, rng, of_modes)
-        else:
-            return machine.assembled()
-        return machine.replace(realisation=modes, pairs=modes.pairs).assembled()
+        if modes is not None:
+            machine = machine.replace(realisation=modes, pairs=modes.pairs)
+        return machine.fed_back() if fed_back else machine.assembled()
 
     @cached_property
     def _base(self) -> Any:

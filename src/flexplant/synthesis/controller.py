@@ -129,6 +129,8 @@ class SolvedController(NamedTuple):
     #: figures for the certificate, and sentences, on how it was found
     checks: tuple[Verified, ...] = ()
     notes: tuple[str, ...] = ()
+    #: whether the first gamma above the bound of single frequencies was reached
+    at_bound: bool = False
 
 
 class SynthesisMethod(Protocol):
@@ -267,6 +269,11 @@ def checked_loop(plant: AnyPlant, blocks: Sequence[Any]) -> ClosedLoop | None:
     with warnings.catch_warnings():  # one warning is enough, where the user called from
         warnings.simplefilter("ignore", FlexplantWarning)
         loop = close_loop(plain, *before, *blocks)
+    return warned(loop)
+
+
+def warned(loop: ClosedLoop) -> ClosedLoop:
+    """Return a loop, with warnings of the effect of its truncated and of its uncertain modes."""
     found = loop.left_out
     if found is not None and not found.is_fine:
         warn(

@@ -228,7 +228,8 @@ def require_reach(problem: Prepared, hidden: str = "") -> None:
     size = max(float(np.linalg.norm(A, 2)) if A.size else 0.0, TINY)
     # the poles of a chain of integrators come out of rounding as a ring around zero
     poles = np.where(np.abs(poles) < SPLIT * size, 0.0, poles)
-    for pole in poles[poles.real > -RESIDUAL * size]:
+    edge = poles[(poles.real > -RESIDUAL * size) & (poles.imag >= 0.0)]
+    for pole in dict.fromkeys(edge.tolist()):  # a conjugate has the same singular values
         for matrix, gain, text in (
             (A, problem.B2, f"u ({', '.join(problem.u)}) does not reach"),
             (A.T, problem.C2.T, f"y ({', '.join(problem.y)}) does not see"),
@@ -237,7 +238,7 @@ def require_reach(problem: Prepared, hidden: str = "") -> None:
             pencil = np.hstack([matrix - pole * np.eye(A.shape[0]), reach])
             if np.linalg.svd(pencil, compute_uv=False)[-1] < ROUNDING * size:
                 raise AssumptionError(
-                    _delay_effect(problem, float(pole.real))
+                    _delay_effect(problem, complex(pole).real)
                     or f"{text} a mode of the plant or of a weight that is not stable "
                     f"({_pole_in_words(problem, complex(pole))}){hidden and ', or ' + hidden}: no "
                     "controller can stabilise it. "

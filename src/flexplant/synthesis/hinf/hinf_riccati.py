@@ -135,13 +135,33 @@ class UncheckedRiccati(Riccati):
         self, problem: Prepared, search: Search, back_off: float | None
     ) -> SolvedController:
         """Return the controller at a distance from the smallest gamma that has one."""
-        bracket = _Bracket(pointwise_bound(problem, coarse=True), self.tolerance, np.inf)
+        bound = pointwise_bound(problem, coarse=True)
+        bracket = _Bracket(bound, self.tolerance, np.inf)
         bracket.close(problem, Progress(0, "", progress=False), lambda *_: 0.0)
         gamma = bracket.high * (1.0 + (_REGULAR if back_off is None else back_off))
         K = _attempt(problem, gamma).controller if gamma < np.inf else None
         if K is None:
             return regular_controller(problem, search, back_off)
-        return SolvedController(K.A, K.B, K.C, K.D, gamma, bracket.low)
+        at_bound = bracket.failed == bound
+        return SolvedController(K.A, K.B, K.C, K.D, gamma, bracket.low, at_bound=at_bound)
+
+    def proven(self, problem: Prepared, found: SolvedController) -> SolvedController | None:
+        """Return what was found, with the norm of its loop, if `Riccati` finds the same; else None.
+
+        It does where the first gamma above the lower bound is reached: it tries no other then.
+        """
+        if not found.at_bound:
+            return None
+        gamma = found.gamma / (1.0 + _REGULAR)
+        first = _attempt(problem, gamma).controller
+        if first is None or resonance_gain(problem, first) > gamma:
+            return None
+        K = StateSpace(*found[:4], inputs=problem.y, outputs=problem.u)
+        norm = _loop_norm(problem, K)
+        if not norm <= found.gamma * (1.0 + FOUR_DIGITS):
+            return None
+        _require_finite_gain(problem, K, norm)
+        return found._replace(gamma=norm)
 
 
 class _Bracket:

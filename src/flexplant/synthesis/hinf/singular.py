@@ -90,7 +90,10 @@ def _missed_modes(p: Prepared) -> tuple[str, ...]:
         # least singular value on the limit of stability is at most the distance to that pole then
         inner = A - B @ np.linalg.pinv(D) @ C
         spectra = [np.asarray(la.eigvals(M), dtype=np.complex128) for M in (A, inner)]
+        points: dict[complex, float] = {}  # integrating modes of several axes share one
         for s, distance in (point for poles in spectra for point in _limit(p, poles)):
+            points[s] = max(distance, points.get(s, 0.0))
+        for s, distance in points.items():
             pencil = np.block([[A - s * np.eye(len(A)), B], [C, D]])
             if la.svdvals(pencil)[-1] <= max(distance, ROOT):
                 omega = abs(np.angle(s)) / p.dt if p.direct else abs(s.imag)
@@ -100,7 +103,10 @@ def _missed_modes(p: Prepared) -> tuple[str, ...]:
 
 
 def _limit(p: Prepared, poles: ComplexArray) -> list[tuple[complex, float]]:
-    """Return points of the limit of stability at slow poles; distances there, zero in chains."""
+    """Return points of the limit of stability at slow poles; distances there, zero in chains.
+
+    A pair has one point: the pencil at the other has the same singular values.
+    """
     # relative to the loop's speed: a mode that decays more slowly than poles are known is taken for
     # undamped. A chain of modes (lags in a row) is shown by no more than the product of their
     # decays, so that those up to the fourth root of what is shown at all, 1 %, count
@@ -114,6 +120,7 @@ def _limit(p: Prepared, poles: ComplexArray) -> list[tuple[complex, float]]:
     distance = np.diagonal(apart)
     single = distance <= SPLIT
     chosen = single | (np.count_nonzero(apart <= CLOSE, axis=1) > 1)
+    chosen &= near.imag >= 0.0
     return list(zip(limit[chosen].tolist(), np.where(single, distance, 0.0)[chosen], strict=True))
 
 

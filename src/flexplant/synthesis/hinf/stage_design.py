@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...arrays import positive
-from ...certificates import Certificate, Verified
+from ...certificates import Certificate, Verified, deferred
 from ...errors import InfeasibleError, ModelError, SolverError, named_modes
-from ...loop import ClosedLoop, close_loop
+from ...loop import ClosedLoop
+from ...loop.blocks import joined
 from ...loop.broken import axis_bandwidths
 from ...loop.other_machines import BEYOND, loop_beside, mode_tolerances
 from ...lti.interconnection import series
@@ -22,13 +23,13 @@ from ...parallel import Progress
 from ...plant import AnyPlant, reference_errors, stage_weights, standard_plant
 from ...plant.machine_plants import PlantMachines
 from ...plant.realisation import natural
-from ...plant.uncertainty.mode_delta import DampingDelta, Frequencies
+from ...plant.uncertainty.mode_delta import DampingDelta, Dampings, Frequencies
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...plant.visibility import untouched_modes
 from ...tolerances import CLOSE, SAME
 from ...updating.residuals.residual import USUAL
-from ..controller import Controller
-from ..pipeline import Design, Solution, designed, solved, verified
+from ..controller import Controller, warned, with_checks
+from ..pipeline import Design, Solution, solved, verified
 from .hinf_design import HinfDesign, TolerantDesign
 from .hinf_riccati import Riccati, UncheckedRiccati
 
@@ -119,7 +120,8 @@ def design_stage(
         controller)``. `tried` lists the bandwidths of the weights with their modulus margins. The
         margin is 0 if the loop does not tolerate the errors of its modes. `certificate` has the
         margin of the final design, and the smallest modulus margin of the machines drawn, without
-        those that do not satisfy the third condition.
+        those that do not satisfy the third condition. What did not decide on the design is computed
+        when the certificate is first read or printed.
 
     Raises
     ------
@@ -159,7 +161,8 @@ def design_stage(
     own = uncertain.plant
     errors = reference_errors(own, poi=poi) if own.assembled.ports.references else None
     task = _StageTask(uncertain, ranges, stated, margin, weights, errors, wanted, progress)
-    return designed(task, own, own)
+    found = solved(task, own)
+    return with_checks(verified(task, found), own, warned(found.found.loop))
 
 
 @dataclass(eq=False)
@@ -181,8 +184,6 @@ class _StageTask(Design):
 
     def __post_init__(self) -> None:
         self.plant = self.uncertain.plant
-        #: with the truncated modes: a controller of the reduced plant may make them unstable
-        self.whole = self.plant.evaluation_plant
         pairs = self.plant.assembled.realisation.pairs[np.array(sorted(self.ranges)) - 1]
         #: the uncertain frequencies [Hz], in the order of the modes
         self.frequencies = natural(pairs)[0] / (2.0 * np.pi)
@@ -222,24 +223,12 @@ class _StageTask(Design):
 
     def restore(self, plant: AnyPlant, problem: AnyPlant, found: _StageTry) -> StateSpace:
         """Return the controller from the sensors and the reference."""
-        return self._block(found.solution.K)
+        return found.loop.blocks[0]
 
     def certify(self, solution: Solution) -> Controller:
         """Return the controller with the checks of its weighted loop, and what was tried."""
         best: _StageTry = solution.found
         answer = verified(best.design, best.solution)
-        checks = [
-            Verified(f"least modulus margin of {best.drawn.those} drawn", best.drawn.margin),
-            Verified("bandwidth of the weights [Hz]", best.bandwidth),
-        ]
-        if self.errors is not None:
-            reached = self._crossing(best.solution.K)
-            checks.append(Verified("|S| of the references below 1 up to [Hz]", reached))
-        fitted = self._fitted() if self.stated else None
-        if fitted is not None:
-            found = _margins(best.whole, fitted, 0.0)
-            name = f"least modulus margin of {found.those} of the fit"
-            checks.append(Verified(name, found.margin))
         route = "a sweep of |1 + L| at u"
         tries = (
             Verified(f"{freq:.4g} Hz", margin, route, self.margin, at_least=True)
@@ -248,11 +237,23 @@ class _StageTask(Design):
         return answer.replace(
             system=solution.K,
             method="H-infinity of a stage",
-            certificate=Certificate((*answer.certificate.checks, *checks)),
+            certificate=deferred(lambda: (*answer.certificate.checks, *self._checks(best))),
             notes=(*answer.notes, *self._without()),
             tried=Certificate(tuple(tries)),
             reached=Certificate(),
         )
+
+    def _checks(self, best: _StageTry) -> Iterator[Verified]:
+        """Yield the figures of the loop and of its machines."""
+        yield Verified(f"least modulus margin of {best.drawn.those} drawn", best.drawn.margin)
+        yield Verified("bandwidth of the weights [Hz]", best.bandwidth)
+        if self.errors is not None:
+            reached = self._crossing(best.loop)
+            yield Verified("|S| of the references below 1 up to [Hz]", reached)
+        fitted = self._fitted() if self.stated else None
+        if fitted is not None:
+            found = _margins(best.whole, fitted, 0.0)
+            yield Verified(f"least modulus margin of {found.those} of the fit", found.margin)
 
     def _without(self) -> list[str]:
         """Return a note on the uncertain modes that do not matter to the loop."""
@@ -267,7 +268,7 @@ class _StageTask(Design):
         fit = measured.fit
         if fit is None or measured.missing:
             return None
-        return measured.each(_MOST_DRAWN, rng=fit.seed)
+        return measured.each(_MOST_DRAWN, rng=fit.seed, fed_back=True)
 
     @cached_property
     def machines(self) -> Iterator[AnyPlant]:
@@ -276,12 +277,12 @@ class _StageTask(Design):
         if fitted is not None:
             return fitted
         known = {d.mode: d.scale for d in self.uncertain.deltas if isinstance(d, DampingDelta)}
-        plant = self.plant.machine
         # modes that do not matter are known: they do not mix with others
         every = self.uncertain.frequencies
         ranges = {mode: self.ranges.get(mode, SAME * off) for mode, off in every.items()}
-        unsure = plant.uncertain(frequency=ranges, damping=known or _DAMPING)
-        return PlantMachines(unsure.nominal).each(_MOST_DRAWN, rng=0)
+        kinds = Dampings(known or _DAMPING), Frequencies(ranges)
+        unsure = UncertainPlant(self.plant.machine, kinds)  # without channels of its Deltas
+        return PlantMachines(unsure.nominal).each(_MOST_DRAWN, rng=0, fed_back=True)
 
     def holds(self, bandwidth: float) -> bool:
         """Design for a bandwidth of the weights, and return whether the loop holds."""
@@ -303,9 +304,7 @@ class _StageTask(Design):
                 self.causes.append(f"{asked:.4g} Hz: {error}")
                 continue
             self.tried.setdefault(one.bandwidth, 0.0)
-            loop = self._loop(one.solution.K)
-            whole = loop if self.whole is None else loop.around(self.whole)
-            margin, drawn, cause = self._judged(loop, whole)
+            margin, drawn, cause = self._judged(one)
             self.causes.append(f"{asked:.4g} Hz: modulus margin {cause}")
             if margin < self.margin:  # of the model itself: more damping does not help
                 self.tried[one.bandwidth] = max(self.tried[one.bandwidth], margin)
@@ -313,7 +312,7 @@ class _StageTask(Design):
             if drawn.margin >= _KEPT * self.margin:
                 self.tried[one.bandwidth] = margin
                 if self.best is None or one.bandwidth > self.best.bandwidth:
-                    self.best = one._replace(drawn=drawn, whole=whole)
+                    self.best = one._replace(drawn=drawn)
                 return True
         return False
 
@@ -326,7 +325,21 @@ class _StageTask(Design):
             HinfDesign(method(progress=False)), self.uncertain, below,
             HinfDesign(UncheckedRiccati(progress=False)),
         )  # fmt: skip
-        return _StageTry(bandwidth, design, solved(design, weighted))
+        solution = solved(design, weighted)
+        return _StageTry(bandwidth, design, solution, self._loop(solution.K))
+
+    def _checked(self, one: _StageTry) -> _StageTry:
+        """Return what `Riccati` gives for the same problem, which is mostly the same controller."""
+        design = replace(one.design, design=HinfDesign(Riccati(progress=False)))
+        (_, weighted, _, found), loop = one.solution, one.loop
+        same = UncheckedRiccati().proven(found.problem, found.found)
+        if same is None:
+            found = design.solve(weighted)
+            loop = self._loop(found.K)
+        else:
+            found = found._replace(found=same)
+        solution = one.solution._replace(K=found.K, found=found)
+        return one._replace(design=design, solution=solution, loop=loop)
 
     def _moved(self, below: float) -> _StageTry:
         """Return the design of the slowest weights with which |S| crosses 1 where it is wanted."""
@@ -336,11 +349,11 @@ class _StageTask(Design):
         method: type[Riccati] = UncheckedRiccati
         for _ in range(_MOST):
             one = self._designed(at, below, method)
-            reached = self._crossing(one.solution.K)
-            if abs(reached / wanted - 1.0) <= CLOSE:
+            reached = self._crossing(one.loop)
+            if abs(reached / wanted - 1.0) <= CLOSE and method is UncheckedRiccati:
                 # checked ones from here on, if the two cross elsewhere
-                one, method = one.checked(), Riccati
-                reached = self._crossing(one.solution.K)
+                one, method = self._checked(one), Riccati
+                reached = self._crossing(one.loop)
             if abs(reached / wanted - 1.0) <= CLOSE:
                 return one
             ends[int(reached > wanted)] = at
@@ -351,33 +364,32 @@ class _StageTask(Design):
         tried = ", ".join(f"{there:.4g} Hz" for _, there in known)
         raise InfeasibleError(f"|S| crosses 1 at {tried} instead")
 
-    def _crossing(self, system: StateSpace) -> float:
+    def _crossing(self, loop: ClosedLoop) -> float:
         """Return where |S| of the slowest axis that is followed crosses 1 [Hz]."""
-        reached = axis_bandwidths(self._loop(system))
         followed = () if self.errors is None else self.errors.inputs
-        return min(hertz for ref, hertz in reached.items() if ref in followed)
+        return min(hertz for ref, hertz in axis_bandwidths(loop).items() if ref in followed)
 
-    def _judged(self, loop: ClosedLoop, whole: ClosedLoop) -> tuple[float, _Margins, str]:
+    def _judged(self, one: _StageTry) -> tuple[float, _Margins, str]:
         """Return the modulus margin, the least one with modes off, and both in words."""
-        # the latter is 0 where a single mode off makes the loop unstable
-        margin = min(loop.modulus_margin, whole.modulus_margin)
+        # the latter is 0 where a single mode off makes the loop unstable. The truncated modes
+        # count: a controller of the reduced plant may make them unstable
+        margin = min(one.loop.modulus_margin, one.whole.modulus_margin)
         said = f"{margin:.3g} on the plant"
         if margin < self.margin:
             return margin, _Margins(0.0), said
-        if not self._tolerates(loop, self.ranges):
+        if not self._tolerates(one.loop, self.ranges):
             said += f", below {_KEPT * self.margin:.3g} with one frequency off"
             return margin, _Margins(0.0), said
         self.machines, each = tee(self.machines)
-        drawn = _margins(whole, each, _KEPT * self.margin)
+        drawn = _margins(one.whole, each, _KEPT * self.margin)
         return margin, drawn, f"{said}, {drawn.margin:.3g} on {drawn.those} drawn"
 
     def _loop(self, system: StateSpace) -> ClosedLoop:
-        """Return the loop on the plant alone: the evaluation of a rejected loop is not needed."""
-        return close_loop(self.plant.replace(evaluation=None), self._block(system))
-
-    def _block(self, system: StateSpace) -> StateSpace:
+        """Return the loop; nothing is computed on the evaluation model before it is read."""
         block = system if self.errors is None else series(self.errors, system)
-        return block.replace(name="stage")
+        blocks = (block.replace(name="stage", dt=self.plant.dt),)
+        plant, controller = joined(self.plant, blocks)
+        return ClosedLoop(plant, blocks, controller)
 
     def _tolerates(self, loop: ClosedLoop, ranges: Mapping[int, float]) -> bool:
         """Return whether any one mode may be off as far as it is uncertain."""
@@ -459,13 +471,10 @@ class _StageTry(NamedTuple):
     bandwidth: float
     design: TolerantDesign
     solution: Solution
-    #: its loop with the truncated modes, and the margins of that on machines
-    whole: Any = None
+    loop: ClosedLoop
     drawn: _Margins = _Margins(0.0)
 
-    def checked(self) -> _StageTry:
-        """Return the same problem solved by `Riccati`."""
-        design = replace(self.design, design=HinfDesign(Riccati(progress=False)))
-        found = design.solve(self.solution.problem)
-        solution = self.solution._replace(K=found.K, found=found)
-        return self._replace(design=design, solution=solution)
+    @property
+    def whole(self) -> ClosedLoop:
+        """Its loop with the truncated modes, if these are known."""
+        return self.loop.completed or self.loop
