@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -84,20 +84,7 @@ class Certificate(Value, Mapping[str, float]):
     checks: tuple[Verified, ...] = field(default_factory=tuple)
 
     def __post_init__(self) -> None:
-        self._set_checks(self.checks)
-
-    def _set_checks(self, checks: Iterable[Verified]) -> None:
-        self._set(checks=tuple({check.what: check for check in checks}.values()))
-
-    if not TYPE_CHECKING:
-
-        def __getattr__(self, name: str) -> Any:
-            """Compute the checks of `deferred` where they are first read."""
-            if name != "checks":
-                return super().__getattr__(name)
-            self._set_checks(self._computed())
-            self.__dict__.pop("_computed", None)  # with all that it holds
-            return self.checks
+        self._set(checks=_latest(self.checks))
 
     @property
     def holds(self) -> bool:
@@ -134,9 +121,12 @@ class Certificate(Value, Mapping[str, float]):
 
 def deferred(computed: Callable[[], Iterable[Verified]]) -> Certificate:
     """Return a certificate whose checks are computed when they are first read, copied or saved."""
-    found = object.__new__(Certificate)
-    object.__setattr__(found, "_computed", computed)
-    return found
+    return Certificate()._put_off(checks=lambda: _latest(computed()))
+
+
+def _latest(checks: Iterable[Verified]) -> tuple[Verified, ...]:
+    """Return checks without those that a later one of the same name replaces."""
+    return tuple({check.what: check for check in checks}.values())
 
 
 def stability_name(sampled: Any) -> str:

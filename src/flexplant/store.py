@@ -73,6 +73,13 @@ class Value(ABC):  # noqa: B024, kinds declare the abstract methods
         for name, value in values.items():
             object.__setattr__(self, name, frozen(value))
 
+    def _put_off(self, **computed: Callable[[], Any]) -> Self:
+        """Have fields without a default value computed where they are first read or copied."""
+        for name in computed:
+            self.__dict__.pop(name)
+        self.__dict__["_computed"] = computed
+        return self
+
     def _fields(self) -> dict[str, Any]:
         return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
 
@@ -99,7 +106,12 @@ class Value(ABC):  # noqa: B024, kinds declare the abstract methods
     if not TYPE_CHECKING:  # a type checker would take any attribute for known
 
         def __getattr__(self, name: str) -> Any:
-            """Say which attributes are near to one that is not there."""
+            """Compute a field that was put off; say which attributes are near to others."""
+            computed = self.__dict__.get("_computed", {})
+            if name in computed:
+                self._set(**{name: computed[name]()})
+                del computed[name]  # with all that it holds
+                return self.__dict__[name]
             known = {n for cls in type(self).__mro__ for n in (*vars(cls), *_annotated(cls))}
             # an existing property that fails raises its own error
             if name.startswith("_") or name in known:

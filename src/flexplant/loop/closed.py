@@ -50,6 +50,7 @@ from .other_machines import (
     loop_interval,
     mode_tolerances,
     reported_tolerances,
+    warn_of_critical,
 )
 
 
@@ -592,6 +593,5 @@ def close_loop(
             "the model's shapes, gains or delay are wrong there. Compare both: "
             "plant.frequency_response(frf.freq) with the measured one."
         )
-    if plant.uncertainty is not None and loop.tolerances is not None:
-        loop.tolerances.warn_of_critical()
+    warn_of_critical(loop)
     return loop

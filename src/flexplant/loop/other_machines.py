@@ -418,6 +418,12 @@ def reported_tolerances(loop: Any) -> ModeTolerances | None:
     return _tolerances(whole_loop, uncertain.frequencies)
 
 
+def warn_of_critical(loop: Any) -> None:
+    """Warn of modes whose stated uncertainty is too large for a loop."""
+    if loop.plant.uncertainty is not None and loop.tolerances is not None:
+        loop.tolerances.warn_of_critical()
+
+
 def _tolerances(loop: Any, known: Mapping[int, float]) -> ModeTolerances | None:
     """Return the tolerances of a stable loop to the changes that a report follows."""
     limit = min(max(CLOSE, BEYOND * DEVIATIONS * max(known.values(), default=0.0)), LIMIT)

@@ -13,6 +13,7 @@ from ..arrays import ComplexArray, FloatArray
 from ..certificates import (
     Certificate,
     Verified,
+    deferred,
     one_line,
     stability,
     stability_check,
@@ -21,6 +22,7 @@ from ..certificates import (
 from ..errors import CertificateError, FlexplantWarning, counted, warn
 from ..loop import ClosedLoop, ModeTolerances, SpillOver, close_loop
 from ..loop.on_measurement import NOT_MEASURED
+from ..loop.other_machines import warn_of_critical
 from ..lti.frequency_sweep import highest, largest_gains, resonance_grid, swept_gains
 from ..lti.norms import peak_gain
 from ..lti.response_solvers import Responder, responder
@@ -88,7 +90,7 @@ class Controller(Value):
     notes: tuple[str, ...] = ()
     structure: Value | None = None
     tried: Certificate = field(default_factory=Certificate)
-    tolerances: ModeTolerances | None = None
+    tolerances: ModeTolerances | None = field(default_factory=lambda: None)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -281,8 +283,7 @@ def warned(loop: ClosedLoop) -> ClosedLoop:
             f"these modes{CLOSE if found.is_high else ''}: choose less bandwidth, keep them in "
             "the plant, or weight the efforts (or roll the controller off) before them."
         )
-    if loop.tolerances is not None:
-        loop.tolerances.warn_of_critical()
+    warn_of_critical(loop)
     return loop
 
 
@@ -297,13 +298,16 @@ def with_left_out(
 
 def with_checks(answer: Controller, plant: AnyPlant, loop: ClosedLoop | None) -> Controller:
     """Return a result with the checks of its loop on truncated and on uncertain modes."""
-    left_out, tolerances = (None, None) if loop is None else (loop.left_out, loop.tolerances)
-    verified = answer.certificate
-    for found in (left_out, tolerances):
-        verified = verified if found is None else verified | found.certificate
+    left_out = None if loop is None else loop.left_out
+
+    def checks() -> list[Verified]:
+        others = () if loop is None else (loop.left_out, loop.tolerances)
+        known = [answer.certificate, *(one.certificate for one in others if one is not None)]
+        return [check for one in known for check in one.checks]
+
     said = [plant.unjudged] if left_out is None and plant.unjudged else []
     measured = None if loop is None else loop.on_measurement
     said.append(NOT_MEASURED if measured is None else measured.summary)
-    return answer.replace(
-        certificate=verified, left_out=left_out, tolerances=tolerances, notes=(*answer.notes, *said)
-    )
+    notes = (*answer.notes, *said)
+    found = answer.replace(certificate=deferred(checks), left_out=left_out, notes=notes)
+    return found if loop is None else found._put_off(tolerances=lambda: loop.tolerances)

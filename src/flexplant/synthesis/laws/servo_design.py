@@ -14,7 +14,7 @@ from ...certificates import Certificate, Verified, stability_check
 from ...errors import ModelError, SolverError, warn
 from ...loop import ClosedLoop
 from ...loop.blocks import drives, driving_blocks
-from ...loop.other_machines import growing_modes, modes_in_words
+from ...loop.other_machines import growing_modes, modes_in_words, warn_of_critical
 from ...lti.frequency_sweep import resonance_grid
 from ...lti.interconnection import loop_poles
 from ...lti.minimal_realisations import minimal
@@ -170,8 +170,7 @@ def design_servo(
             f"with the modes that the plant truncates the loop at {at} is {left_out.summary}. "
             f"The machine has these modes{CLOSE if left_out.is_high else ''}. {advice}"
         )
-    if closed.tolerances is not None:
-        closed.tolerances.warn_of_critical()
+    warn_of_critical(closed)
     task.reading.warn_of_held(axes)
     centres = ", ".join(f"{notch.freq:.4g}" for notch in law.notches)
     notes = [f"notches at {centres} Hz"] if centres else []
