@@ -9,7 +9,7 @@ import scipy.linalg as la
 
 import flexplant as fx
 from flexplant.errors import AssumptionError, FlexplantWarning, ModelError
-from flexplant.loop.other_machines import mode_tolerances
+from flexplant.loop.modal_tolerances import mode_tolerances
 from flexplant.plant.uncertainty.delta import with_changes
 from flexplant.plant.uncertainty.mode_delta import FrequencyDelta
 from stages import RATE, ports, sampled, some_modes

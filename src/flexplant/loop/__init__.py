@@ -35,8 +35,8 @@ from .closed import ClosedLoop as ClosedLoop
 from .closed import close_loop as close_loop
 from .delayed_loops import DelayedLoop as DelayedLoop
 from .measured_loop import in_axes as in_axes
+from .modal_tolerances import ModeTolerances as ModeTolerances
 from .on_measurement import OnMeasurement as OnMeasurement
-from .other_machines import ModeTolerances as ModeTolerances
 from .other_machines import SpillOver as SpillOver
 from .report import LoopComparison as LoopComparison
 from .report import LoopFigures as LoopFigures

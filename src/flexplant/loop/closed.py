@@ -38,18 +38,15 @@ from .budget import (
     stationary_row,
     unverified_variances,
 )
+from .modal_tolerances import MARGIN, ModeTolerances, mode_tolerances, reported_tolerances
 from .on_measurement import NOT_MEASURED, OnMeasurement, judged
 from .other_machines import (
-    MARGIN,
     MachineLoops,
-    ModeTolerances,
     SpillOver,
     growing_modes,
     high,
     interval_line,
     loop_interval,
-    mode_tolerances,
-    reported_tolerances,
     warn_of_critical,
 )
 

@@ -16,7 +16,8 @@ from ...errors import InfeasibleError, ModelError, SolverError, named_modes
 from ...loop import ClosedLoop
 from ...loop.blocks import joined
 from ...loop.broken import axis_bandwidths
-from ...loop.other_machines import BEYOND, loop_beside, mode_tolerances
+from ...loop.modal_tolerances import BEYOND, mode_tolerances
+from ...loop.other_machines import loop_beside
 from ...lti.interconnection import series
 from ...lti.statespace import StateSpace
 from ...parallel import Progress
