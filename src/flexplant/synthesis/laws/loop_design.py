@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -53,7 +53,7 @@ class DesignedLoops(Value):
     report: LoopReport
     left_out: SpillOver | None = None
     notes: tuple[str, ...] = ()
-    tolerances: ModeTolerances | None = None
+    tolerances: ModeTolerances | None = field(default_factory=lambda: None)
 
     def __repr__(self) -> str:
         axes = ", ".join(self.laws)
@@ -224,10 +224,11 @@ def made(
         return DesignedLoops(system, laws, report)
     feedback = system.select(inputs=axes.after.inputs)  # references take no part in the loop
     loop = checked_loop(axes.given, [feedback])
-    left_out, tolerances = (None, None) if loop is None else (loop.left_out, loop.tolerances)
+    left_out = None if loop is None else loop.left_out
     alone = axes.given.unjudged
     notes = (alone,) if left_out is None and alone else ()
-    return DesignedLoops(system, laws, report, left_out, notes, tolerances)
+    found = DesignedLoops(system, laws, report, left_out, notes)
+    return found if loop is None else found._put_off(tolerances=lambda: loop.tolerances)
 
 
 def checked_laws(axes: Axes, laws: LawElement | Mapping[str, LawElement]) -> dict[str, Law]:
