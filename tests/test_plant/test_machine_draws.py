@@ -12,7 +12,7 @@ import flexplant as fx
 from flexplant.errors import AssumptionError, ModelError
 from flexplant.estimation.filter_models import _difference, _driven_modes
 from flexplant.plant.machine_draws import MachineFamily, small_exponential
-from flexplant.plant.machine_plants import interval_of, interval_text
+from flexplant.plant.machine_plants import PlantMachines, interval_of, interval_text
 from flexplant.plant.realisation import realise
 from flexplant.simulation import exposure_errors
 from flexplant.updating.machines import Draw
@@ -492,7 +492,7 @@ def test_a_specification_says_what_is_met_on_machines(plant):
 
 
 @pytest.mark.long
-def test_a_stage_is_judged_on_the_machines_of_its_fit(plant):
+def test_a_stage_is_judged_on_the_machines_of_its_fit(plant, monkeypatch):
     """Without stated frequencies they decide; with them the certificate has their margin too."""
     promised = "least modulus margin of 20 machines "
     for given, name in ((plant, "drawn"), (plant.uncertain(frequency=0.02), "of the fit")):
@@ -502,6 +502,14 @@ def test_a_stage_is_judged_on_the_machines_of_its_fit(plant):
         assert found.certificate[promised + name] == pytest.approx(min(each))
         assert min(each) >= 0.35
     assert found.certificate[promised + "drawn"] != pytest.approx(min(each))
+
+    def beyond(*_):
+        raise ModelError("a mass is negative.")
+
+    monkeypatch.setattr(PlantMachines, "_of_fit", beyond)
+    again = fx.design_stage(plant.uncertain(frequency=0.02), bandwidth=20.0)
+    with pytest.warns(fx.FlexplantWarning, match=r"no margin on machines of the fit: .* negative"):
+        assert promised + "of the fit" not in again.certificate
 
 
 @pytest.mark.slow
