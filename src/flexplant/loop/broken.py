@@ -22,8 +22,6 @@ from ..words import instance
 from .blocks import references
 
 Side = Literal["u", "y"]
-#: loop gain below which |S| is at most 1 / (1 - 0.5), usually below its maximum
-_SMALL = 0.5
 #: fraction of the largest |S| above which it is computed instead of bounded
 _NEAR = 0.8
 #: logarithmic step of a grid that is refined at the peaks of |S|
@@ -144,20 +142,26 @@ def sensitivity(L: ComplexArray, inner: ComplexArray | None = None) -> ComplexAr
     return S if inner is None else S - S @ inner
 
 
-def sensitivity_size(L: ComplexArray, inner: ComplexArray | None = None) -> FloatArray:
+def sensitivity_size(
+    L: ComplexArray, inner: ComplexArray | None = None, near: float = _NEAR
+) -> FloatArray:
     """Return sigma_max of `sensitivity` at each frequency, a lower bound where it is not high.
 
-    Where the Frobenius norms of L and of the inner loop are l < 1 and k, sigma_max lies between
-    (1 - k) / (1 + l) and (1 + k) / (1 - l). Elsewhere, with m and s^2 the mean and the variance of
-    the n eigenvalues of S* S, its square lies between ``m + s / sqrt(n - 1)`` and ``m + s sqrt(n -
-    1)`` [WolkowiczStyan1980]_.
+    With the mean a of the diagonal of I - L and the Frobenius norms e of I - L - a I and k of the
+    inner loop, sigma_max lies between ``(1 - k) / sqrt(|a|^2 + e^2 / n)`` and
+    ``(1 + k) / (|a| - e)``. Elsewhere, with m and s^2 the mean and the variance of the n
+    eigenvalues of S* S, its square lies between ``m + s / sqrt(n - 1)`` and ``m + s sqrt(n - 1)``
+    [WolkowiczStyan1980]_.
     """
-    gain, less = _frobenius(L), 0.0 if inner is None else _frobenius(inner)
-    size, acts = np.maximum(1.0 - less, 0.0) / (1.0 + gain), gain >= _SMALL
-    for _ in range(2):
-        if acts.any():
-            size[acts] = norm_or_bound(sensitivity(L[acts], None if inner is None else inner[acts]))
-        acts = (gain < _SMALL) & (size.max(initial=0.0) * (1.0 - gain) < 1.0 + less)
+    mean, k = np.einsum("fii->f", L) / L.shape[-1], 0.0 if inner is None else _frobenius(inner)
+    a = np.abs(1.0 - mean)
+    e = np.sqrt(np.maximum(_frobenius(L) ** 2 - L.shape[-1] * np.abs(mean) ** 2, 0.0))
+    size = np.maximum(1.0 - k, 0.0) / np.maximum(np.sqrt(a**2 + e**2 / L.shape[-1]), TINY)
+    acts = (a - e) * size.max(initial=0.0) < 1.0 + k
+    if acts.any():
+        size[acts] = norm_or_bound(
+            sensitivity(L[acts], None if inner is None else inner[acts]), near
+        )
     return np.asarray(size)
 
 
@@ -165,15 +169,15 @@ def _frobenius(L: ComplexArray) -> FloatArray:
     return np.asarray(np.sqrt(np.sum(L.real**2 + L.imag**2, axis=(1, 2))))
 
 
-def norm_or_bound(S: ComplexArray) -> FloatArray:
+def norm_or_bound(S: ComplexArray, near: float = _NEAR) -> FloatArray:
     """Return sigma_max of S where it may be near its maximum, else its lower bound."""
     n, square = S.shape[-1], S.conj().swapaxes(1, 2) @ S
     mean = np.einsum("fii->f", square).real / n
     spread = np.sum(square.real**2 + square.imag**2, axis=(1, 2)) / n - mean**2
     spread = np.sqrt(np.maximum(spread, 0.0) / max(n - 1, 1))
     low = mean + spread
-    near = mean + (n - 1) * spread >= _NEAR**2 * low.max(initial=0.0)
-    low[near] = np.linalg.eigvalsh(square[near])[:, -1]
+    high = mean + (n - 1) * spread >= near**2 * low.max(initial=0.0)
+    low[high] = np.linalg.eigvalsh(square[high])[:, -1]
     return np.asarray(np.sqrt(low))
 
 

@@ -316,7 +316,7 @@ class ServoLoop:
 
     def _sizes(self, law: ServoLaw, some: IntArray | slice = slice(None)) -> FloatArray:
         loop = self.broken(law, some)
-        return peaking_size(sensitivity(*loop)) if self.mixed else sensitivity_size(*loop)
+        return peaking_size(sensitivity(*loop)) if self.mixed else sensitivity_size(*loop, 1.0)
 
     @cached_property
     def at(self) -> Callable[[ServoLaw], ComplexArray]:
