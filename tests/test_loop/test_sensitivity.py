@@ -226,3 +226,23 @@ def test_frequencies_of_small_gain_hide_no_peak(size):
     assert found.max() == pytest.approx(exact.max(), rel=1e-12)
     assert np.argmax(found) == np.argmax(exact)
     assert np.all(found <= exact * (1 + 1e-12))
+
+
+@pytest.mark.parametrize("inner", [0.0, 0.3])
+@pytest.mark.parametrize("apart", [0.0, 0.02, 0.5])
+def test_loops_that_are_nearly_a_number_times_one_hide_no_peak(apart, inner):
+    """Of any gain, with an inner loop or not; at the critical point itself too."""
+    rng = np.random.default_rng(7)
+
+    def drawn(size):
+        return size * (rng.normal(size=(300, 4, 4)) + 1j * rng.normal(size=(300, 4, 4)))
+
+    turn = np.exp(1j * np.linspace(-np.pi, -0.4, 300)) * np.geomspace(1e4, 1e-3, 300)
+    L, own = turn[:, None, None] * (np.eye(4) + drawn(apart)), drawn(inner / 4)
+    exact = np.linalg.svd(np.linalg.solve(np.eye(4) - L, np.eye(4) - own), compute_uv=False)[:, 0]
+    for near in (0.8, 1.0):
+        found = sensitivity_size(L, own, near)
+        assert found.max() == pytest.approx(exact.max(), rel=1e-9)
+        assert np.all(found <= exact * (1 + 1e-9))
+    L[150] = np.eye(4)
+    assert np.argmax(sensitivity_size(L)) == 150 and sensitivity_size(L)[150] > 1e9
