@@ -12,7 +12,7 @@ import flexplant as fx
 from flexplant.errors import AssumptionError, ModelError
 from flexplant.estimation.filter_models import _difference, _driven_modes
 from flexplant.plant.machine_draws import MachineFamily, small_exponential
-from flexplant.plant.machine_plants import PlantMachines, interval_of, interval_text
+from flexplant.plant.machine_plants import interval_of, interval_text
 from flexplant.plant.realisation import realise
 from flexplant.simulation import exposure_errors
 from flexplant.updating.machines import Draw
@@ -506,7 +506,7 @@ def test_a_stage_is_judged_on_the_machines_of_its_fit(plant, monkeypatch):
     def beyond(*_):
         raise ModelError("a mass is negative.")
 
-    monkeypatch.setattr(PlantMachines, "_of_fit", beyond)
+    monkeypatch.setattr(fx.plant.PlantMachines, "_of_fit", beyond)
     again = fx.design_stage(plant.uncertain(frequency=0.02), bandwidth=20.0)
     with pytest.warns(fx.FlexplantWarning, match=r"no margin on machines of the fit: .* negative"):
         assert promised + "of the fit" not in again.certificate
