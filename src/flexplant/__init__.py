@@ -94,27 +94,27 @@ to run. The rows of 30 603 DOFs are from a run in which other work used both cor
 
 | task | flexplant | peer | its time | ratio |
 |---|---|---|---|---|
-| 24 modes of a solid, 27 783 DOFs | 2.7 s | scipy eigsh | 21 s | 7.8 |
+| 24 modes of a solid, 27 783 DOFs | 2.5 s | scipy eigsh | 20 s | 8 |
 | 24 modes of a plate, 30 603 DOFs | 0.95 s | scipy eigsh on CHOLMOD | 0.98 s | 1 |
 | 24 modes of a plate, 30 603 DOFs | 1 s | scipy eigsh on PARDISO | 0.76 s | 0.76 |
-| all 243 modes of a plate, dense | 8.1 ms | scipy eigh | 4.6 ms | 0.57 |
-| 200 lines of a plate's responses, 30 000 DOFs | 1.2 s | scipy splu (4 of them) | 350 s | 310 |
-| 8 x 8 frequency responses, 10 000 lines | 3.5 ms | python-control, slycot | 0.1 s | 29 |
-| H-infinity norm, 48 states, 0.1 % damping | 1.6 ms | slycot ab13dd | 1.8 ms | 1.1 |
-| the same, A dense | 1.8 ms | slycot ab13dd | 1.9 ms | 1.1 |
-| H2 norm, 200 states | 1.7 ms | python-control, slycot | 3.2 ms | 1.9 |
-| zero-order hold, 48 states | 0.094 ms | scipy cont2discrete | 0.12 ms | 1.3 |
-| a discrete Riccati equation, 48 states | 2.5 ms | scipy solve_discrete_are | 6.1 ms | 2.5 |
-| 100 000 samples through a Kalman filter | 27 ms | filterpy (5000 of them) | 4.5 s | 160 |
-| 100 000 samples of a loop, 212 states | 54 ms | python-control | 1.3 s | 23 |
-| the same with its white noises | 0.16 s | python-control | 1.3 s | 7.8 |
-| the loop with saturated commands | 1.4 s | python-control (2000 of them) | 2.6 s | 1.9 |
-| H-infinity, 3 states: norm 0.137 | 9.5 ms | python-control, slycot: 0.137 | 14 ms | 1.5 |
-| H-infinity, 61 states of a stage: norm 0.901 | 0.32 s | slycot: no answer in 10 s | - | - |
-| mu of 12 complex scalars, both bounds | 10 ms | slycot ab13md, the upper one | 10 ms | 1 |
-| the upper bound alone | 5.7 ms | slycot ab13md, the upper one | 10 ms | 1.8 |
-| poles of a close pair in noise: error 5e-07 | 0.11 s | scikit-rf: 7e-07 | 90 ms | 0.82 |
-| a sparse OUTPUT4 file of Nastran | 7.3 ms | pyYeti | 24 ms | 3.2 |
+| all 243 modes of a plate, dense | 7 ms | scipy eigh | 4.3 ms | 0.62 |
+| 200 lines of a plate's responses, 30 000 DOFs | 1.1 s | scipy splu (4 of them) | 340 s | 310 |
+| 8 x 8 frequency responses, 10 000 lines | 3.5 ms | python-control, slycot | 0.11 s | 31 |
+| H-infinity norm, 48 states, 0.1 % damping | 1.6 ms | slycot ab13dd | 1.9 ms | 1.2 |
+| the same, A dense | 1.7 ms | slycot ab13dd | 1.9 ms | 1.1 |
+| H2 norm, 200 states | 1.7 ms | python-control, slycot | 3.3 ms | 1.9 |
+| zero-order hold, 48 states | 0.098 ms | scipy cont2discrete | 0.12 ms | 1.3 |
+| a discrete Riccati equation, 48 states | 2.5 ms | scipy solve_discrete_are | 6.2 ms | 2.5 |
+| 100 000 samples through a Kalman filter | 28 ms | filterpy (5000 of them) | 4.5 s | 160 |
+| 100 000 samples of a loop, 212 states | 43 ms | python-control | 1.2 s | 27 |
+| the same with its white noises | 0.12 s | python-control | 1.1 s | 8.8 |
+| the loop with saturated commands | 1.4 s | python-control (2000 of them) | 2.5 s | 1.8 |
+| H-infinity, 3 states: norm 0.137 | 9.1 ms | python-control, slycot: 0.137 | 15 ms | 1.6 |
+| H-infinity, 61 states of a stage: norm 0.901 | 0.23 s | slycot: no answer in 10 s | - | - |
+| mu of 12 complex scalars, both bounds | 10 ms | slycot ab13md, the upper one | 11 ms | 1 |
+| the upper bound alone | 6 ms | slycot ab13md, the upper one | 10 ms | 1.7 |
+| poles of a close pair in noise: error 5e-07 | 0.1 s | scikit-rf: 7e-07 | 79 ms | 0.79 |
+| a sparse OUTPUT4 file of Nastran | 6.4 ms | pyYeti | 24 ms | 3.7 |
 
 Peers are faster for some tasks because flexplant also checks its results. For all modes of the
 plate, a quarter of the time goes into residuals. Another quarter goes into the separation of
