@@ -567,7 +567,8 @@ def test_a_fit_and_its_correlation_pair_alike(plate):
     assert fit.values[0] == pytest.approx(0.05, rel=5e-3)
     before = correlate(rom, [Eigenvalues(poles), shapes])
     pairs = np.abs(fit.history.eigenvalues[0]) / np.abs(poles.poles) - 1
-    np.testing.assert_allclose(pairs, before.freq_error, rtol=0, atol=1e-12)
+    # two modes are equal: rounding decides which of them is which
+    np.testing.assert_allclose(pairs, before.freq_error, rtol=0, atol=1e-10)
 
 
 def test_criteria_by_hand():
