@@ -107,10 +107,10 @@ class Value(ABC):  # noqa: B024, kinds declare the abstract methods
 
         def __getattr__(self, name: str) -> Any:
             """Compute a field that was put off; say which attributes are near to others."""
-            computed = self.__dict__.get("_computed", {})
-            if name in computed:
-                self._set(**{name: computed[name]()})
-                del computed[name]  # with all that it holds
+            late = self.__dict__.get("_computed", {}).get(name)
+            if late is not None:
+                self._set(**{name: late()})
+                self.__dict__["_computed"].pop(name, None)  # with all that it holds
                 return self.__dict__[name]
             known = {n for cls in type(self).__mro__ for n in (*vars(cls), *_annotated(cls))}
             # an existing property that fails raises its own error

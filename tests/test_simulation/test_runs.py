@@ -62,12 +62,20 @@ LOOPS = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", LOOPS)
-def test_blocks_are_the_samples_one_by_one(kind):
+@pytest.mark.parametrize(
+    ("kind", "silent"),
+    [
+        *((kind, ()) for kind in LOOPS),
+        ("stage", ("amp", "y2:noise")),
+        ("stage", ("amp", "y1:noise", "y2:noise")),
+    ],
+)
+def test_blocks_are_the_samples_one_by_one(kind, silent):
     """With noise, a start that is not rest and more than one piece of blocks."""
     loop = LOOPS[kind]()
     rng = np.random.default_rng(0)
     given = rng.standard_normal((10_003, len(loop.plant.w))) * 1e-6
+    given[:, [name in silent for name in loop.plant.w]] = 0.0
     start = 1e-6 * rng.standard_normal(loop.monitored.n_states)
     noise = white_noise(loop.plant)
     fast, plain = (

@@ -1,6 +1,7 @@
 """certified_norm: no wrong loop passes; the sweep finds what a dense grid finds."""
 
 import pickle
+import threading
 
 import numpy as np
 import pytest
@@ -133,3 +134,16 @@ def test_a_deferred_certificate_that_fails_fails_each_time():
             read(later)
     with pytest.raises(AttributeError, match="check"):
         _ = Certificate().check
+
+
+def test_a_deferred_certificate_is_read_in_two_threads_at_once():
+    def checks():
+        if not seen:  # another thread reads it before the first is done
+            seen.append({})
+            other = threading.Thread(target=lambda: seen.append(dict(later)))
+            other.start()
+            other.join()
+        return [Verified("norm", 1.0)]
+
+    seen, later = [], deferred(checks)
+    assert dict(later) == seen[1] == {"norm": 1.0}
