@@ -77,7 +77,7 @@ class Value(ABC):  # noqa: B024, kinds declare the abstract methods
         """Have fields without a default value computed where they are first read or copied."""
         for name in computed:
             self.__dict__.pop(name)
-        self.__dict__["_computed"] = computed
+        self.__dict__.setdefault("_computed", {}).update(computed)
         return self
 
     def _fields(self) -> dict[str, Any]:
@@ -128,7 +128,8 @@ class Value(ABC):  # noqa: B024, kinds declare the abstract methods
     def __dir__(self) -> list[str]:
         """Return what is for use: fields, properties and methods, no private or inherited ones."""
         public = {n for cls in type(self).__mro__ for n in vars(cls)} - {"registry"}
-        return sorted(n for n in public | set(self._fields()) if not n.startswith("_"))
+        names = {field.name for field in fields(self)}  # type: ignore[arg-type]
+        return sorted(n for n in public | names if not n.startswith("_"))
 
     def _repr_html_(self) -> str:
         """Return what notebooks show: the repr, laid out, or a table of the fields."""

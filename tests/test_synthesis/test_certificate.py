@@ -129,6 +129,7 @@ def test_a_deferred_certificate_that_fails_fails_each_time():
         raise CertificateError("two routes disagree")
 
     later = deferred(checks)
+    assert "checks" in dir(later)  # which shows names, and computes nothing
     for read in (dict, repr, len, pickle.dumps):
         with pytest.raises(CertificateError, match="two routes"):
             read(later)

@@ -567,8 +567,8 @@ def test_a_fit_and_its_correlation_pair_alike(plate):
     assert fit.values[0] == pytest.approx(0.05, rel=5e-3)
     before = correlate(rom, [Eigenvalues(poles), shapes])
     pairs = np.abs(fit.history.eigenvalues[0]) / np.abs(poles.poles) - 1
-    # two modes are equal: rounding decides which of them is which
-    np.testing.assert_allclose(pairs, before.freq_error, rtol=0, atol=1e-10)
+    # two modes are equal: the rounding of their split hangs on their basis, 2e-12 on one kernel
+    np.testing.assert_allclose(pairs, before.freq_error, rtol=0, atol=1e-11)
 
 
 def test_criteria_by_hand():

@@ -212,10 +212,10 @@ def servo_bandwidth(
 
     The responses of plant and observer are computed once on a grid that includes resonances. The
     loop is opened at the plant's input; the observer still receives u. Bandwidths are tried from
-    high to low in steps of 9 %, after an unstable loop in one of 18 %. A bandwidth that keeps the
-    peak on the grid is accepted if the closed loop is stable, its modulus margin is at least 1 /
-    peak, and every axis with a reference has |S| of at most 0.3 at a twentieth of the bandwidth.
-    Truncated modes are included if known. A bisection then searches above the accepted bandwidth.
+    high to low in steps of 9 %. A bandwidth that keeps the peak on the grid is accepted if the
+    closed loop is stable, its modulus margin is at least 1 / peak, and every axis with a reference
+    has |S| of at most 0.3 at a twentieth of the bandwidth. Truncated modes are included if known. A
+    bisection then searches above the accepted bandwidth.
 
     Parameters
     ----------
@@ -517,11 +517,11 @@ class ServoTask:
         def fine(loop: ClosedLoop) -> bool:
             return loop.modulus_margin >= 1.0 / peak
 
-        def holds(bandwidth: float) -> bool | None:
+        def holds(bandwidth: float) -> bool:
             nonlocal best
             law = self.law(bandwidth)
             if self.phase_margins(law).min() <= 0.0 or self.radius(law) >= 1.0:
-                return None
+                return False
             size, at = self.loop.peak(law)
             if size < best[0]:
                 best = size, at, bandwidth

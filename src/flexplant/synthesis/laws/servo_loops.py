@@ -547,22 +547,13 @@ def observer_system(
     return inner
 
 
-def highest_bandwidth(freq: Sequence[float], holds: Callable[[float], bool | None]) -> float | None:
-    """Return the largest frequency that holds: of a descending grid, then by bisection above.
-
-    After an unstable one, None, the next is left out, and tried only if no other holds.
-    """
-    i, above, left = 0, 0, []
-    while i < len(freq) and not (held := holds(freq[i])):
-        left += [i + 1] if held is None else []
-        above, i = i, i + (2 if held is None else 1)
-    if i >= len(freq):
-        i = next((one for one in left if one < len(freq) and holds(freq[one])), i)
-        above = i - 1
-    if not 0 < i < len(freq):  # none, or the first
-        return freq[0] if not i else None
-    low, high = freq[i], freq[above]
-    for _ in range(5 + i - above):
+def highest_bandwidth(freq: Sequence[float], holds: Callable[[float], bool]) -> float | None:
+    """Return the largest frequency that holds: of a descending grid, then by bisection above."""
+    i = next((i for i, one in enumerate(freq) if holds(one)), None)
+    if not i:  # none, or the first
+        return None if i is None else freq[0]
+    low, high = freq[i], freq[i - 1]
+    for _ in range(6):
         middle = float(np.sqrt(low * high))
         low, high = (middle, high) if holds(middle) else (low, middle)
     return low
