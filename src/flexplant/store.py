@@ -109,7 +109,10 @@ class Value(ABC):  # noqa: B024, kinds declare the abstract methods
             """Compute a field that was put off; say which attributes are near to others."""
             late = self.__dict__.get("_computed", {}).get(name)
             if late is not None:
-                self._set(**{name: late()})
+                try:
+                    self._set(**{name: late()})
+                except AttributeError as error:  # getattr and hasattr would take it for absence
+                    raise RuntimeError(f"{name} cannot be computed: {error}") from error
                 self.__dict__["_computed"].pop(name, None)  # with all that it holds
                 return self.__dict__[name]
             known = {n for cls in type(self).__mro__ for n in (*vars(cls), *_annotated(cls))}

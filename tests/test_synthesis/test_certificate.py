@@ -137,6 +137,17 @@ def test_a_deferred_certificate_that_fails_fails_each_time():
         _ = Certificate().check
 
 
+def test_a_field_put_off_whose_computation_lacks_an_attribute_is_not_a_missing_field():
+    def checks():
+        return np.zeros(1).no_such_thing
+
+    later = deferred(checks)
+    for read in (lambda v: hasattr(v, "checks"), lambda v: getattr(v, "checks", ()), dict):
+        with pytest.raises(RuntimeError, match=r"^checks cannot.*no_such_thing") as found:
+            read(later)
+        assert isinstance(found.value.__cause__, AttributeError)
+
+
 def test_a_deferred_certificate_is_read_in_two_threads_at_once():
     def checks():
         if not seen:  # another thread reads it before the first is done
