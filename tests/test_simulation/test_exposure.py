@@ -96,5 +96,7 @@ def test_what_is_no_exposure():
         exposure_errors(made(np.zeros((1, 100)), ["y1"]))
     with pytest.raises(LabelError, match="no channel"):
         exposure_errors(run, ["die:errror"])
-    with pytest.raises(ModelError, match="is too late"):
+    with pytest.raises(ModelError, match=r"^after=1 s is too late"):
         settling_time(run, "die:error", ma=1.0, after=1.0)
+    with pytest.raises(ModelError, match=r"^after has a NaN"):
+        settling_time(run, "die:error", ma=1.0, after=np.nan)

@@ -193,7 +193,7 @@ def settling_time(
     """
     instance(run, Response, "run", "Pass what simulate returned.")
     limit = positive(ma, "ma"), np.inf if msd is None else positive(msd, "msd")
-    part = _exposure_slices(run, after, None)[0]
+    part = _exposure_slices(run, after, None, "after")[0]
     most = part.stop - part.start
     count = window_samples(window, run.dt, most, f"the run after {after:g} s")
     average, deviation = _window_moments(run[channel][..., part], count, False)
@@ -227,14 +227,14 @@ def _poi_of(channel: str) -> str:
     return place if axis in _AXES and place else channel.removesuffix(":error")
 
 
-def _exposure_slices(run: Response, start: Any, exposures: Any) -> list[slice]:
-    """Return the samples of each exposure."""
+def _exposure_slices(run: Response, start: Any, exposures: Any, name: str = "start") -> list[slice]:
+    """Return the samples of each exposure; messages call the start `name`."""
     if run.time.size < 2:
         raise ModelError(
             "the run has a single sample, which is too short for a window. Run it longer."
         )
     if exposures is None:
-        return [slice(first_sample(run, start), run.time.size)]
+        return [slice(first_sample(run, start, name), run.time.size)]
     windows = real_array(exposures, "exposures")
     if windows.ndim != 2 or windows.shape[1] != 2 or not windows.size:
         raise ShapeError(

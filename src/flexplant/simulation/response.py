@@ -219,15 +219,15 @@ class Response(Value, Mapping[str, FloatArray]):
         return unit * mean, unit * deviation
 
 
-def first_sample(run: Response, start: float) -> int:
-    """Return the number of the first sample from a time [s] on."""
-    first = float(real_array(start, "start", ()))
+def first_sample(run: Response, start: float, name: str = "start") -> int:
+    """Return the number of the first sample from a time [s] on, which messages call `name`."""
+    first = float(real_array(start, name, ()))
     # half a sample of slack: start=0.1 means the sample at 0.1 s, however that was rounded
     found = int(np.searchsorted(run.time, first - 0.5 * run.dt))
     if found == run.time.size:
         raise ModelError(
-            f"start={first:g} s is too late: the response ends at {run.time[-1]:g} s. "
-            "Choose an earlier start, or simulate for longer."
+            f"{name}={first:g} s is too late: the response ends at {run.time[-1]:g} s. "
+            "Choose an earlier time, or simulate for longer."
         )
     return found
 
