@@ -44,6 +44,8 @@ DEVIATIONS = 2.0
 CERTAIN = 6.0
 #: largest number of steps of an iteration that converges: 60 bisections or doublings reach rounding
 MOST_STEPS = 60
+#: number of plants of which is kept, for all of their loops, what no controller changes
+KEPT_PLANTS = 8
 #: numbers that were typed, or printed into a file by another program, have at least six digits; no
 #: model of a machine is better known, so that two ways to one figure agree to this
 TYPED = 1e-6

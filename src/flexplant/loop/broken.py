@@ -16,8 +16,7 @@ from ..lti.measured_lines import FEWEST, HiddenModes, MeasuredPlant
 from ..lti.response_solvers import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant
-from ..plant.axes import KEPT
-from ..tolerances import CLOSE, MOST_STEPS, NULL, RANK, TINY, TYPED
+from ..tolerances import CLOSE, KEPT_PLANTS, MOST_STEPS, NULL, RANK, TINY, TYPED
 from ..words import instance
 from .blocks import references
 
@@ -238,7 +237,7 @@ class Path(NamedTuple):
     respond: Responder
 
 
-@lru_cache(maxsize=KEPT)
+@lru_cache(maxsize=KEPT_PLANTS)
 def plant_path(plant: AnyPlant, driven: tuple[str, ...]) -> Path:
     """Return the path between some actuators and y."""
     system = plant.system.select(plant.y, driven)

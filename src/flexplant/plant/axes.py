@@ -13,7 +13,7 @@ from ..arrays import ComplexArray, FloatArray, divisor, positive
 from ..errors import AssumptionError, LabelError, ModelError, require_known, some_names
 from ..lti.statespace import StateSpace
 from ..store import Value
-from ..tolerances import TYPED
+from ..tolerances import KEPT_PLANTS, TYPED
 from ..words import name_list
 from .assumptions import axes_in_words
 from .building import rigid_shapes
@@ -33,8 +33,6 @@ _OF_RATE, _OF_MODE = 0.01, 0.2
 _UNLIKE = 2.0
 #: what counts as rest, relative to a usual bandwidth: squared it is below what tests of rest see
 _RESTING = 1e-4
-#: plants of which is kept what no controller changes, for all of their loops
-KEPT = 8
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -277,7 +275,7 @@ def felt(
     return np.asarray(np.where(np.abs(G) > TYPED * most, G, 0.0))
 
 
-@lru_cache(maxsize=KEPT)
+@lru_cache(maxsize=KEPT_PLANTS)
 def _apart_at_rest(plant: Partition, channels: tuple[str, ...]) -> bool:
     return apart(_at_rest(plant, channels))
 
@@ -315,7 +313,7 @@ def _balanced(G: FloatArray) -> tuple[FloatArray, FloatArray]:
     return scaled, columns
 
 
-@lru_cache(maxsize=KEPT)
+@lru_cache(maxsize=KEPT_PLANTS)
 def force_units(plant: Partition) -> dict[str, str]:
     """Return the unit of force of each actuator, as a multiple of its unit, if that matters."""
     # the loop at u is T C G, whose |S| is that of the axes times up to the condition number of T

@@ -28,7 +28,8 @@ from ...lti.interconnection import connect
 from ...lti.response_solvers import responses
 from ...lti.statespace import StateSpace
 from ...plant import EvaluationModel, Foreign, StandardPlant
-from ...plant.axes import KEPT, DrivenAxes, complex_gain, force_units, oscillations
+from ...plant.axes import DrivenAxes, complex_gain, force_units, oscillations
+from ...tolerances import KEPT_PLANTS
 from .controller_elements import Integrator, LowPass, Notch, Pid
 from .law import Law, decoupled, product, tustin_s
 
@@ -110,10 +111,10 @@ class Axis:
 
 
 #: equal laws are one, so that what is known of it is found at once
-known_axis = lru_cache(maxsize=_NOTCHES * KEPT)(Axis)
+known_axis = lru_cache(maxsize=_NOTCHES * KEPT_PLANTS)(Axis)
 
 
-@lru_cache(maxsize=_NOTCHES * KEPT)
+@lru_cache(maxsize=_NOTCHES * KEPT_PLANTS)
 def _series(shape: Law, notches: tuple[Notch, ...]) -> Matrices:
     """Return A, B, C and D of a law and notches, sampled."""
     if not notches:
@@ -121,12 +122,12 @@ def _series(shape: Law, notches: tuple[Notch, ...]) -> Matrices:
     return cascaded(_series(shape, notches[:-1]), _sampled(notches[-1], shape.rate))
 
 
-@lru_cache(maxsize=_NOTCHES * KEPT)
+@lru_cache(maxsize=_NOTCHES * KEPT_PLANTS)
 def _notch(freq: float, depth: float, width: float) -> Notch:
     return Notch(freq, depth, width)
 
 
-@lru_cache(maxsize=_NOTCHES * KEPT)
+@lru_cache(maxsize=_NOTCHES * KEPT_PLANTS)
 def _sampled(notch: Notch, rate: float) -> Matrices:
     return notch.sampled(rate).matrices
 
@@ -459,7 +460,7 @@ class ServoLoop:
         return [modes[int(np.argmin(off[0]))]]
 
 
-@lru_cache(maxsize=KEPT)
+@lru_cache(maxsize=KEPT_PLANTS)
 def reading_of(plant: StandardPlant, channels: tuple[str, ...]) -> Reading:
     """Return what a servo on some channels reads."""
     ports = {poi.channel(axis): (poi, axis) for poi in plant.assembled.ports.z for axis in poi.axes}
@@ -474,7 +475,7 @@ def reading_of(plant: StandardPlant, channels: tuple[str, ...]) -> Reading:
     )
 
 
-@lru_cache(maxsize=KEPT)
+@lru_cache(maxsize=KEPT_PLANTS)
 def servo_loop(
     plant: StandardPlant, observer: StateSpace | None, reading: Reading, known: StandardPlant
 ) -> ServoLoop:
@@ -495,7 +496,7 @@ def _stack(
     return np.ascontiguousarray(np.moveaxis(found, -1, 0))
 
 
-@lru_cache(maxsize=2 * KEPT)
+@lru_cache(maxsize=2 * KEPT_PLANTS)
 def _part(system: StateSpace, outputs: tuple[str, ...], inputs: tuple[str, ...]) -> StateSpace:
     return system.select(outputs, inputs)
 
@@ -509,7 +510,7 @@ def path_of(plant: StandardPlant, observer: StateSpace | None, reading: Reading)
     return connect([plant.system.select(read, plant.u), observer], plant.u, reads)
 
 
-@lru_cache(maxsize=KEPT)
+@lru_cache(maxsize=KEPT_PLANTS)
 def seeing(plant: StandardPlant, reading: Reading) -> StandardPlant:
     """Return the plant whose y are the references and the axes themselves, named as read."""
     g, nz = plant.system, len(plant.z)
