@@ -15,6 +15,7 @@ from flexplant.plant import (
     gravity_axes,
     suspend,
 )
+from flexplant.plant.axes import force_units
 from stages import CORNERS, INSET, NOISE, RATE, Z8, L, full, ports, reduced, some_modes
 
 MASS = 0.6 * 0.6 * 0.0272 * 2702
@@ -160,3 +161,12 @@ def test_axes_are_apart_whatever_the_bandwidth(seed):
             np.testing.assert_allclose(found.T, T, rtol=0, atol=1e-3 * np.abs(T).max())
         with pytest.raises(AssumptionError, match="do not move these axes apart"):
             fx.plant.driven_axes(plant(b[:, [0, 0]]), freq=freq)
+
+
+def test_the_units_of_unlike_forces_are_kept_and_read_only():
+    plant = fx.testbeds.dual_stage()
+    units = force_units(plant)
+    assert units == {"long": "26.2 N", "short": "1 N"}
+    assert force_units(plant) is units
+    with pytest.raises(TypeError):
+        units["long"] = "N"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -231,7 +231,7 @@ class ClosedLoop(Value):
             self.poles,
             self.plant.dt,
             units=self.units,
-            forces=cache(lambda: force_units(self.plant.machine)),
+            forces=lambda: force_units(self.plant.machine),
         )
 
     @property

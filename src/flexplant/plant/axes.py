@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -314,22 +315,20 @@ def _balanced(G: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 @lru_cache(maxsize=KEPT_PLANTS)
-def force_units(plant: Partition) -> dict[str, str]:
+def force_units(plant: Partition) -> Mapping[str, str]:
     """Return the unit of force of each actuator, as a multiple of its unit, if that matters."""
     # the loop at u is T C G, whose |S| is that of the axes times up to the condition number of T
     try:
         T = driven_axes(plant).T
     except (AssumptionError, ModelError):  # without axes there is nothing to compare by
-        return {}
+        return MappingProxyType({})
     scaled, sizes = _balanced(T.T)
     if _evenness(scaled) <= _UNLIKE * _evenness(T / divisor(np.linalg.norm(T, axis=0))):
-        return {}
+        return MappingProxyType({})
     forces = sizes.max() / sizes
     units = [plant.units.get(name, "") for name in plant.u]
-    return {
-        name: f"{force:.3g} {unit}".strip()
-        for name, force, unit in zip(plant.u, forces, units, strict=True)
-    }
+    texts = (f"{force:.3g} {unit}".strip() for force, unit in zip(forces, units, strict=True))
+    return MappingProxyType(dict(zip(plant.u, texts, strict=True)))
 
 
 def idle_forces(plant: Partition, actuators: Sequence[str]) -> FloatArray:
