@@ -298,16 +298,22 @@ def with_left_out(
 
 def with_checks(answer: Controller, plant: AnyPlant, loop: ClosedLoop | None) -> Controller:
     """Return a result with the checks of its loop on truncated and on uncertain modes."""
-    left_out = None if loop is None else loop.left_out
 
     def checks() -> list[Verified]:
         others = () if loop is None else (loop.left_out, loop.tolerances)
         known = [answer.certificate, *(one.certificate for one in others if one is not None)]
         return [check for one in known for check in one.checks]
 
-    said = [plant.unjudged] if left_out is None and plant.unjudged else []
     measured = None if loop is None else loop.on_measurement
-    said.append(NOT_MEASURED if measured is None else measured.summary)
-    notes = (*answer.notes, *said)
-    found = answer.replace(certificate=deferred(checks), left_out=left_out, notes=notes)
+    said = NOT_MEASURED if measured is None else measured.summary
+    found = answer.replace(certificate=deferred(checks))
+    checked: Controller = with_modes(found, plant, loop, said)
+    return checked
+
+
+def with_modes(found: Any, plant: AnyPlant, loop: ClosedLoop | None, *further: str) -> Any:
+    """Return a result with its loop on truncated and on uncertain modes, and further notes."""
+    left_out = None if loop is None else loop.left_out
+    unjudged = (plant.unjudged,) if left_out is None and plant.unjudged else ()
+    found = found.replace(left_out=left_out, notes=(*found.notes, *unjudged, *further))
     return found if loop is None else found._put_off(tolerances=lambda: loop.tolerances)

@@ -20,7 +20,7 @@ from ...parallel import one_thread
 from ...plant import AnyPlant, decouple
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...store import Value
-from ..controller import checked_loop
+from ..controller import checked_loop, with_modes
 from .law import Axes, Law, LawElement, axes_controller, connected
 
 
@@ -224,11 +224,8 @@ def made(
         return DesignedLoops(system, laws, report)
     feedback = system.select(inputs=axes.after.inputs)  # references take no part in the loop
     loop = checked_loop(axes.given, [feedback])
-    left_out = None if loop is None else loop.left_out
-    alone = axes.given.unjudged
-    notes = (alone,) if left_out is None and alone else ()
-    found = DesignedLoops(system, laws, report, left_out, notes)
-    return found if loop is None else found._put_off(tolerances=lambda: loop.tolerances)
+    found: DesignedLoops = with_modes(DesignedLoops(system, laws, report), axes.given, loop)
+    return found
 
 
 def checked_laws(axes: Axes, laws: LawElement | Mapping[str, LawElement]) -> dict[str, Law]:
