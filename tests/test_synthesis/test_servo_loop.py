@@ -16,7 +16,7 @@ from flexplant.plant import Actuator, Disturbance, Poi, Ports, Reference, Sensor
 from flexplant.structure import FEModel, ModalDamping, chain
 from flexplant.synthesis import design_servo, servo_bandwidth
 from flexplant.synthesis.laws.servo_design import servo_task
-from flexplant.synthesis.laws.servo_loops import suppressed_up_to
+from flexplant.synthesis.laws.servo_loops import verified_suppression
 from flexplant.testbeds import three_masses, wafer_stage
 from oracles_plant import closed_loop
 from stages import RATE, block, calibrated, ports, reduced, sampled
@@ -207,7 +207,9 @@ def test_search_and_certificate_break_the_same_loop():
             gain = task.closed(law).broken.gain(task.loop.freq)
             np.testing.assert_allclose(found @ (np.eye(gain.shape[1]) - gain), 1.0, rtol=1e-6)
             # and |S| of the reference, by the closed loop from w to z
-            assert task._suppressed_up_to(law) == pytest.approx(suppressed_up_to(task.closed(law)))
+            assert task._suppressed_up_to(law) == pytest.approx(
+                verified_suppression(task.closed(law))
+            )
 
 
 def test_a_bandwidth_between_unstable_ones_is_found():

@@ -45,7 +45,7 @@ from .servo_loops import (
     reading_of,
     seeing,
     servo_loop,
-    suppressed_up_to,
+    verified_suppression,
 )
 
 #: what to do where a bandwidth does not hold: that search takes seconds
@@ -164,7 +164,7 @@ def design_servo(
         _refuse(closed, at, observer is not None, advice)
     elif any(name.endswith(":ref") for name in closed.plant.w):
         what = "|S| of the references below 1 up to [Hz]"
-        checks.append(Verified(what, suppressed_up_to(closed), "a sweep of S"))
+        checks.append(Verified(what, verified_suppression(closed), "a sweep of S"))
     if left_out is not None and not left_out.is_fine and closed.is_stable:
         warn(
             f"with the modes that the plant truncates the loop at {at} is {left_out.summary}. "
@@ -389,7 +389,7 @@ class ServoTask:
         return bool(np.all(far | free))
 
     def _suppressed_up_to(self, law: ServoLaw) -> float:
-        """Return the least frequency [Hz] at which |S| of a reference first crosses 1."""
+        """Return `ServoLoop.suppressed_up_to` of the plant, on a grid through its resonances."""
         grid = resonance_grid(loop_poles(self.whole, law.matrices), self.plant.dt)
         return replace(self.loop, freq=grid, plant=self.plant).suppressed_up_to(law)
 

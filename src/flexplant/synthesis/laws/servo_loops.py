@@ -560,8 +560,8 @@ def highest_bandwidth(freq: Sequence[float], holds: Callable[[float], bool]) -> 
     return low
 
 
-def suppressed_up_to(closed: ClosedLoop) -> float:
-    """Return the least frequency [Hz] of a grid at which |S| of a reference first crosses 1."""
+def verified_suppression(closed: ClosedLoop) -> float:
+    """Return the frequency [Hz] of `ServoLoop.suppressed_up_to`, from the closed loop instead."""
     plant = closed.plant
     response = closed.frequency_response(closed.broken.grid)
     sizes = (
