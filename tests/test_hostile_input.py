@@ -7,9 +7,8 @@ import pandas as pd
 import pytest
 
 import flexplant as fx
-from flexplant.arrays import complex_array, positions, positive, real_array, whole
+from flexplant.arrays import complex_array, name_list, positions, positive, real_array, whole
 from flexplant.errors import FlexplantError
-from flexplant.words import name_list
 
 HUGE = 10**400
 #: no number of any use, of one axis or none

@@ -18,7 +18,7 @@ ROOT = Path(flexplant.__file__).parent
 #: in import order; the first entry is the foundation, whose modules may use each other
 ROOMS = (
     (
-        *("errors", "rooms", "arrays", "words", "store", "certificates", "parallel"),
+        *("errors", "rooms", "arrays", "store", "certificates", "parallel"),
         *("tolerances", "fingerprints", "work", "dof_columns", "labels", "bibliography"),
         "algorithms",
     ),

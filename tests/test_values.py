@@ -9,10 +9,18 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from flexplant.arrays import generator, positive, real_array, seed_sequence, whole
+from flexplant.arrays import (
+    check_names,
+    generator,
+    name_list,
+    positive,
+    real_array,
+    seed_sequence,
+    signal_names,
+    whole,
+)
 from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.store import Value, frozen, rebuild
-from flexplant.words import check_names, name_list, signal_names
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -11,11 +11,10 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from .arrays import FloatArray, IntArray, node_numbers, real_array
+from .arrays import FloatArray, IntArray, as_list, node_numbers, real_array
 from .errors import LabelError, ShapeError, unknown_label
 from .store import Value
 from .tolerances import SAME
-from .words import as_list
 
 DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
 #: a place: a DOF label, a point (x, y, z) [m], or a mapping {label or point: weight}

@@ -1,4 +1,4 @@
-"""Everything that flexplant raises or warns with.
+"""Everything that flexplant raises or warns with, and the texts: names and sizes in words.
 
 ::
 
@@ -24,13 +24,14 @@ import logging
 import re
 import sys
 import warnings
-from collections.abc import Hashable, Iterable, Iterator, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from types import BuiltinFunctionType, FunctionType, MethodType
 from typing import Any
 
 import numpy as np
+from scipy import constants
 
 __all__ = [
     "AssumptionError",
@@ -43,6 +44,21 @@ __all__ = [
     "ShapeError",
     "SolverError",
 ]
+
+_PREFIXES = (
+    (constants.femto, "f"),
+    (constants.pico, "p"),
+    (constants.nano, "n"),
+    (constants.micro, "\N{MICRO SIGN}"),
+    (constants.milli, "m"),
+    (1.0, ""),
+    (constants.kilo, "k"),
+    (constants.mega, "M"),
+)
+#: units that take a prefix, alone or before others: m^2, N m, rad/s
+_PREFIXED = re.compile(r"(m|g|s|N|rad|Hz|V|A|W|J|Pa|T)(?:\^(\d))?(?![A-Za-z])")
+#: number of names, rows or findings that a text shows of many
+SHOWN = 4
 
 
 def __dir__() -> list[str]:
@@ -133,6 +149,42 @@ def some_names(names: Sequence[str], most: int = 6, *, total: bool = True) -> st
     """Return the first names as text, and, if there are more, the number of all."""
     more = f", ...{f' ({len(names)} in all)' if total else ''}" if len(names) > most else ""
     return ", ".join(names[:most]) + more
+
+
+def in_unit(size: float, unit: str | None) -> tuple[float, str]:
+    """Return the factor and the unit with its SI prefix that bring a size to 1 .. 1000."""
+    base, per = (unit[1:], 1e-3) if unit and unit.startswith("kg") else (unit or "", 1.0)
+    head = _PREFIXED.match(base)
+    if head is None or not size or not np.isfinite(size):
+        return 1.0, unit or ""
+    power = int(head[2] or 1)
+    known = ((factor**power, prefix) for factor, prefix in _PREFIXES)
+    most = size / (per * 1e3**power) * (1.0 + 1e-9)  # 1e-6 m is 1 um, whatever rounding says
+    factor, prefix = next((s for s in known if most < s[0]), (1e6**power, "M"))
+    return per * factor, prefix + base
+
+
+def with_unit(value: float, unit: str | None) -> str:
+    """Return a number in words: `0.527 nm`; without a unit as it is."""
+    factor, shown = in_unit(abs(value), unit)
+    return f"{value / factor:.3g} {shown}".rstrip()
+
+
+def with_deviation(value: float, deviation: float | None) -> str:
+    """Return a number in words, without digits below its standard deviation."""
+    if deviation is None:
+        return f"{value:.7g}"
+    known = 7
+    if value and deviation > 0 and np.isfinite(deviation):
+        known = min(max(int(np.floor(np.log10(abs(value) / deviation))) + 2, 1), 7)
+    return f"{value:.{known}g} +- {deviation:.2g}"
+
+
+def sizes_of(sizes: Mapping[str, float], units: Mapping[str, str], most: int = 4) -> str:
+    """Return sizes of channels in words, `die:z 0.527 nm, die:rx 3.1 nrad`, and how many more."""
+    shown = [f"{name} {with_unit(size, units.get(name))}" for name, size in sizes.items()]
+    more = [f"... ({len(shown) - most} more)"] if len(shown) > most else []
+    return ", ".join(shown[:most] + more)
 
 
 def aligned(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:

@@ -11,7 +11,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from .arrays import LARGEST_NODE, FloatArray, IntArray, node_numbers, real_array
+from .arrays import (
+    LARGEST_NODE,
+    FloatArray,
+    IntArray,
+    as_list,
+    check_names,
+    instance,
+    name_list,
+    node_numbers,
+    real_array,
+)
 from .dof_columns import DIRECTIONS as DIRECTIONS
 from .dof_columns import Interpolation as Interpolation
 from .dof_columns import Place as Place
@@ -19,7 +29,6 @@ from .dof_columns import columns_of, in_box, rotation_hint, unknown_dof
 from .errors import LabelError, ShapeError, counted, require_known, short, unknown_label
 from .store import Value, frozen
 from .tolerances import SAME
-from .words import as_list, check_names, instance, name_list
 
 
 def direction_names(directions: Any, name: str = "directions") -> tuple[str, ...]:

@@ -19,12 +19,11 @@ import numpy as np
 import pytest
 
 import flexplant as fx
-from flexplant.errors import FlexplantWarning, LabelError, ModelError
+from flexplant.errors import FlexplantWarning, LabelError, ModelError, with_unit
 from flexplant.plot._axes import Device
 from flexplant.plot.coinciding_curves import widen_hidden
 from flexplant.plot.html_report import _ports_table
 from flexplant.plot.node_lines import neighbours
-from flexplant.words import with_unit
 from stages import RATE, ports, reduced, some_modes
 
 CHROMIUM = next(

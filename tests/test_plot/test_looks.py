@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 import flexplant as fx
-from flexplant.errors import ModelError
+from flexplant.errors import ModelError, in_unit
 from flexplant.lti import inverse_sensitivity, tf
 from flexplant.plot import CYCLE, STYLES
 from flexplant.plot._axes import styles
-from flexplant.words import in_unit
 from stages import reduced, sampled
 
 PLANT = tf([1.0], [1.0, 1.0, 0.0])

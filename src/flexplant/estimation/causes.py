@@ -7,11 +7,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from ..arrays import ComplexArray, FloatArray, IntArray, divisor
-from ..errors import counted
+from ..errors import counted, with_unit
 from ..modes.matching import NEAR
 from ..plant import AnyPlant
 from ..tolerances import NEGLIGIBLE, SAME, TINY
-from ..words import with_unit
 from .estimator import KalmanEstimator
 from .filter_models import innovation_root
 from .innovations import ExcessPeak, InnovationLines, InnovationParts, impulse, steady_gain

@@ -8,13 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arrays import ComplexArray, FloatArray, between, real_array
+from ..arrays import ComplexArray, FloatArray, between, instance, real_array
 from ..errors import ModelError, ShapeError, aligned, counted, short
 from ..loop import ClosedLoop
 from ..plant import AnyPlant
 from ..store import Value
 from ..tolerances import MOST_STEPS, SAME
-from ..words import instance
 from .causes import (
     Cause,
     Examined,

@@ -14,7 +14,16 @@ import numpy as np
 import scipy.linalg as la
 
 from ..arrays import ComplexArray, FloatArray, IntArray, divisor
-from ..errors import AssumptionError, CertificateError, ModelError, SolverError, unknown_label, warn
+from ..errors import (
+    SHOWN,
+    AssumptionError,
+    CertificateError,
+    ModelError,
+    SolverError,
+    sizes_of,
+    unknown_label,
+    warn,
+)
 from ..loop import ClosedLoop, close_loop
 from ..loop.budget import check_stationary, source_variances, sources
 from ..lti.blocks_of_states import ModalMap, equal_matrices
@@ -34,7 +43,6 @@ from ..plant import AnyPlant
 from ..plant.machine_plants import FigureInterval, interval, interval_text
 from ..store import Value
 from ..tolerances import CLOSE, INTERVAL, MISSED, ROOT, ROUNDING, TINY, TYPED
-from ..words import SHOWN, sizes_of
 from .filter_models import poi_channels, same_pois, sensors
 
 #: fraction of a variance above which such modes are named

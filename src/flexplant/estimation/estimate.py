@@ -13,14 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import BoolArray, FloatArray, IntArray, real_array
-from ..errors import ChannelError, LabelError, SolverError, counted, unknown_label, warn
+from ..arrays import BoolArray, FloatArray, IntArray, instance, known_units, real_array
+from ..errors import ChannelError, LabelError, SolverError, counted, sizes_of, unknown_label, warn
 from ..lti.equations import scale_of, solve_stein
 from ..lti.response_solvers import Recursion
 from ..parallel import PIECE, one_thread
 from ..store import Value
 from ..tolerances import TYPED
-from ..words import instance, known_units, sizes_of
 from .error import estimates, row_of
 from .filter_models import FEW_DIGITS, FilterModel, innovation_root
 from .passage import STATIONARY, Moment, Start, Walk, recorded, stationary_start

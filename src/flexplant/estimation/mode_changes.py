@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import BoolArray, ComplexArray, FloatArray
+from ..errors import with_deviation
 from ..identification import MeasuredModes
 from ..lti.frequency import frequency_response
 from ..parallel import one_thread
@@ -16,7 +17,6 @@ from ..plant import AnyPlant
 from ..plant.uncertainty.delta import Delta, with_changes
 from ..plant.uncertainty.mode_delta import DampingDelta, FrequencyDelta
 from ..store import Value
-from ..words import with_deviation
 from .estimate import Estimate
 from .estimator import KalmanEstimator
 from .innovations import InnovationLines, density_of, whitening

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arrays import FloatArray, number, positive
+from ..arrays import FloatArray, flag, number, positive
 from ..errors import AssumptionError, LabelError, ModelError, require_known, short
 from ..loop import ClosedLoop, ScheduledLoop
 from ..loop.blocks import applied_law
@@ -17,7 +17,6 @@ from ..lti.statespace import StateSpace, as_statespace
 from ..store import named_file, written
 from ..synthesis.aftercare.forms import back_gain, scheduled_form, two_state_form
 from ..tolerances import SAME
-from ..words import flag
 from .c_text import CText
 
 #: keywords of C, and names of its library that end in _t

@@ -17,11 +17,11 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from ..arrays import one_of
 from ..errors import LabelError, ModelError, warn
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant
 from ..store import named_file, written
-from ..words import one_of
 from .c_code import c_name, c_program
 from .c_text import CText
 

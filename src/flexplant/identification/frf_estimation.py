@@ -8,11 +8,10 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ComplexArray, FloatArray
+from ..arrays import ComplexArray, FloatArray, members
 from ..errors import ModelError, ShapeError, warn
 from ..lti.frequency import Frf
 from ..tolerances import TINY
-from ..words import members
 from .periodic import Periodic, averages_advised, periodic_frf
 from .spectra import H1Estimator, SpectralMethod, dropouts_warned, records, spectral_frf
 

@@ -7,12 +7,21 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import ComplexArray, FloatArray, IntArray, between, positive, real_array, whole
+from ..arrays import (
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    between,
+    instance,
+    positive,
+    real_array,
+    several,
+    whole,
+)
 from ..errors import LabelError, ModelError, SolverError, require_known, short, warn
 from ..lti.frequency import Frf
 from ..parallel import one_thread
 from ..tolerances import ROUNDING
-from ..words import instance, several
 from .diagram import (
     BROADEST,
     STEADY,

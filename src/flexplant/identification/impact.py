@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ComplexArray, FloatArray, IntArray, between, positive
+from ..arrays import ComplexArray, FloatArray, IntArray, between, instance, positive
 from ..errors import ModelError, ShapeError, SolverError, counted, require_known, short
 from ..lti.frequency import Frf, error_statistics
 from ..store import Value
 from ..tolerances import CERTAIN, TINY
-from ..words import instance
 from .lines import mains_multiple
 from .result import IdentifiedModes
 from .spectra import Records, dropouts_warned, records

@@ -10,12 +10,11 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..arrays import BoolArray, ComplexArray, FloatArray, IntArray, frequency_band
+from ..arrays import BoolArray, ComplexArray, FloatArray, IntArray, frequency_band, instance
 from ..errors import ModelError
 from ..lti.frequency import Frf
 from ..parallel import so_far
 from ..tolerances import CHANCE, RANK, TINY
-from ..words import instance
 from .frf_estimation import STRETCH
 
 #: frequencies [Hz] of mains

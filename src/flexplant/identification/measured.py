@@ -15,9 +15,12 @@ from ..arrays import (
     ComplexArray,
     FloatArray,
     between,
+    check_names,
     complex_array,
+    instance,
     positive,
     real_array,
+    several,
     whole,
 )
 from ..errors import LabelError, ModelError, ShapeError, counted, short, some_names
@@ -25,7 +28,6 @@ from ..modes import Modes
 from ..modes.matching import assigned, in_span
 from ..store import Value
 from ..tolerances import SAME, SPLIT
-from ..words import check_names, instance, several
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import ComplexArray, FloatArray, positive, real_array
+from ..arrays import ComplexArray, FloatArray, positive, real_array, signal_names
 from ..errors import ModelError, ShapeError, require_known, warn
 from ..lti.frequency import ORDERS, Frf, checked_overlap, checked_window, error_statistics
 from ..store import Value, checked
 from ..tolerances import ROUNDING, TINY
-from ..words import signal_names
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)

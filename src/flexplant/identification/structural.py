@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import ComplexArray, FloatArray, IntArray, divisor, whole
+from ..arrays import ComplexArray, FloatArray, IntArray, divisor, flag, instance, whole
 from ..certificates import Certificate, Verified
 from ..errors import LabelError, ModelError, counted, warn
 from ..labels import DofSet
@@ -15,7 +15,6 @@ from ..modes import Modes
 from ..structure import interpolated
 from ..structure.rigid import rigid_motions
 from ..tolerances import NEGLIGIBLE
-from ..words import flag, instance
 from .result import IdentifiedModes
 
 #: fraction of the largest eigenvalue of an inertia or a flexibility below which a negative

@@ -11,11 +11,10 @@ from typing import Any, cast
 import numpy as np
 import scipy
 
-from ..arrays import FloatArray, Matrix, real_array
+from ..arrays import FloatArray, Matrix, mapping, one_of, real_array
 from ..errors import FlexplantError, LabelError, ModelError
 from ..labels import DIRECTIONS, DofSet, node_dofs
 from ..modes import Modes
-from ..words import mapping, one_of
 from .fe_modes import MODE_READERS, FileShapes, check_mass, damping_ratios, frequencies
 from .files import ELSEWHERE, Elsewhere, damaged, file_path, parsing
 from .triplets import extra_module

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray, positive, real_array
+from ..arrays import FloatArray, IntArray, instance, positive, real_array
 from ..certificates import Certificate, Verified
 from ..errors import FlexplantError, LabelError, ModelError, ShapeError, counted
 from ..labels import DofSet
@@ -18,7 +18,6 @@ from ..structure import FEMatrices, FEModel
 from ..structure.unit_systems import Units
 from ..structure.unit_systems import units as unit_system
 from ..tolerances import FOUR_DIGITS
-from ..words import instance
 from .files import damaged, file_path, three_units, unread
 
 MISSING = (

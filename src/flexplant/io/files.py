@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import FloatArray
+from ..arrays import FloatArray, several
 from ..errors import FlexplantError, ModelError, short
 from ..structure import FEMatrices
 from ..structure.definite import EVERY_DIGIT
-from ..words import several
 
 #: least number of characters of a number printed by a program; shorter ones may be typed by hand
 _PRINTED = 12

@@ -11,11 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import FloatArray
+from ..arrays import FloatArray, instance, mapping
 from ..errors import FlexplantError, LabelError, ModelError, ShapeError, require_known
 from ..lti.frequency import Frf
 from ..store import written
-from ..words import instance, mapping
 from .files import decimal, file_path, parsing, refused, text_of
 from .mat_matrices import mat_variables
 

@@ -12,11 +12,11 @@ from typing import Any, TypeAlias
 import numpy as np
 import scipy.sparse as sp
 
+from ..arrays import name_list
 from ..errors import FlexplantError, ModelError, require_known
 from ..labels import DofSet
 from ..structure.definite import digits_of
 from ..structure.matrices import FEMatrices, completed
-from ..words import name_list
 from .files import FORMATS, LINE, USUAL, Format, check_count, damaged, file_path, fixed_numbers
 from .nastran import named_matrices
 

@@ -11,14 +11,13 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..arrays import FloatArray, IntArray, real_array
+from ..arrays import FloatArray, IntArray, instance, real_array
 from ..errors import LabelError, ModelError, require_known
 from ..labels import DIRECTIONS, DofSet, Interpolation, component_columns
 from ..reduction import ReducedModel
 from ..store import Value
 from ..structure import FEModel
 from ..tolerances import ROUNDING, SAME
-from ..words import instance
 
 #: types of models that can be joined
 Model = FEModel | ReducedModel

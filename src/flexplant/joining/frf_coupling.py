@@ -7,12 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arrays import ComplexArray, FloatArray, IntArray, divisor
+from ..arrays import ComplexArray, FloatArray, IntArray, divisor, flag, instance, mapping
 from ..errors import CertificateError, LabelError, ModelError, warn
 from ..labels import DofSet
 from ..lti import Frf
 from ..tolerances import CLOSE, RANK, ROOT, SAME
-from ..words import flag, instance, mapping
 from .frf_joints import (
     FrfLink,
     channel_rows,

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import ComplexArray, FloatArray
+from ..arrays import ComplexArray, FloatArray, instance
 from ..dof_columns import at_nodes
 from ..errors import LabelError, ModelError, unknown_label, warn
 from ..labels import DIRECTIONS, DofSet
@@ -16,7 +16,6 @@ from ..lti import Frf
 from ..lti.frequency import ORDERS
 from ..structure.rigid import rigid_motions
 from ..tolerances import SAME
-from ..words import instance
 from .joint import Joint, JointEnd, Patch, joint_axes
 
 #: fraction below which a joint counts as a repetition of other joints

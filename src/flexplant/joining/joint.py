@@ -9,13 +9,20 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray, node_numbers, positive_array, real_array
+from ..arrays import (
+    FloatArray,
+    IntArray,
+    instance,
+    name_list,
+    node_numbers,
+    positive_array,
+    real_array,
+)
 from ..errors import LabelError, ModelError, require_known, short
 from ..labels import DIRECTIONS, DofSet
 from ..store import Value
 from ..structure.rigid import rigid_motions
 from ..tolerances import FOUR_DIGITS, ROOT, SAME
-from ..words import instance, name_list
 
 #: an end: "stage/41:z", "stage/41" (a node), ("stage", (x, y, z)) or a Patch
 End: TypeAlias = "str | tuple[str, Sequence[float]] | Patch"

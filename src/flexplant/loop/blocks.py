@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import ComplexArray, FloatArray
+from ..arrays import ComplexArray, FloatArray, inner_names
 from ..errors import AssumptionError, LabelError, ModelError, unknown_label
 from ..lti.blocks_of_states import equal_matrices
 from ..lti.interconnection import among, connect
@@ -17,7 +17,6 @@ from ..lti.statespace import StateSpace
 from ..plant import AnyPlant
 from ..plant.port import DERIVATIVES
 from ..tolerances import SAME
-from ..words import inner_names
 from .anti_windup import recovery_gain
 
 

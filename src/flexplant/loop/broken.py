@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from ..arrays import ComplexArray, FloatArray
+from ..arrays import ComplexArray, FloatArray, instance
 from ..errors import LabelError, short
 from ..lti.frequency_sweep import SOUGHT, climbed_grid, crossings, highest, resonance_grid
 from ..lti.measured_lines import FEWEST, HiddenModes, MeasuredPlant
@@ -17,7 +17,6 @@ from ..lti.response_solvers import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant
 from ..tolerances import CLOSE, KEPT_PLANTS, MOST_STEPS, NULL, RANK, TINY, TYPED
-from ..words import instance
 from .blocks import references
 
 Side = Literal["u", "y"]

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arrays import FloatArray, divisor, real_array
+from ..arrays import FloatArray, divisor, instance, real_array
 from ..certificates import Certificate, Verified
 from ..errors import (
     AssumptionError,
@@ -17,6 +17,7 @@ from ..errors import (
     LabelError,
     ModelError,
     aligned,
+    in_unit,
     require_known,
     short,
 )
@@ -30,7 +31,6 @@ from ..plant.building import continuous_factor, white_names
 from ..plant.partitioned import NOT_JUDGED
 from ..store import Value
 from ..tolerances import MOST_STEPS, ROOT, TYPED
-from ..words import in_unit, instance
 
 #: name of the contribution of a set-point
 RESIDUE = "set-point residue"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ComplexArray, FloatArray
+from ..arrays import ComplexArray, FloatArray, name_list
 from ..errors import ModelError, only_one, require_known, warn
 from ..lti.frequency import Frf, sampled_freq
 from ..lti.interconnection import lft, loop_poles
@@ -23,7 +23,6 @@ from ..plant.machine_plants import FigureInterval, fitted_response
 from ..plant.uncertainty.uncertain_plants import UncertainPlant
 from ..store import Value
 from ..tolerances import INTERVAL
-from ..words import name_list
 from .blocks import as_block, commands, joined, tapped, with_known
 from .broken import BrokenLoop, Path, plant_path
 from .budget import (

@@ -10,13 +10,12 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ComplexArray, FloatArray, real_array
+from ..arrays import ComplexArray, FloatArray, one_of, real_array
 from ..errors import AssumptionError, ModelError, SolverError, counted
 from ..lti.delays import Delayed, delayed
 from ..lti.peaks import PEAKS
 from ..store import Value
 from ..tolerances import FOUR_DIGITS, ROUNDING, SETTLED
-from ..words import one_of
 
 #: the loop gain below which a loop no longer turns, over its distance to 1 at infinity
 _QUIET = 0.1

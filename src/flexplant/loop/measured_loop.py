@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import ComplexArray, FloatArray, IntArray, positive
+from ..arrays import ComplexArray, FloatArray, IntArray, flag, instance, positive
 from ..errors import LabelError, ModelError, ShapeError, counted, unknown_label
 from ..lti.frequency import Frf, frequency_response
 from ..lti.frequency_sweep import around_resonance
@@ -15,7 +15,6 @@ from ..lti.measured_lines import FEWEST, SHOWN, STEP, HiddenModes, MeasuredPlant
 from ..lti.response_solvers import Responder
 from ..lti.statespace import StateSpace, System, as_statespace
 from ..tolerances import MOST_STEPS, SAME, TINY
-from ..words import flag, instance
 from .broken import BrokenLoop, inverted
 
 #: degrees of freedom above which a variance is not averaged

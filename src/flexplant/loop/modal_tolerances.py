@@ -10,13 +10,12 @@ import numpy as np
 
 from ..arrays import FloatArray, IntArray, positive, real_array
 from ..certificates import Certificate, Verified
-from ..errors import AssumptionError, ModelError, aligned, counted, warn
+from ..errors import SHOWN, AssumptionError, ModelError, aligned, counted, warn
 from ..plant import AnyPlant, standard_plant
 from ..plant.realisation import natural
 from ..plant.uncertainty.uncertain_plants import UncertainPlant
 from ..store import Value
 from ..tolerances import CLOSE, DEVIATIONS, TINY
-from ..words import SHOWN
 from .broken import BrokenLoop
 from .mode_crossings import LIMIT, ModeLoops, axis_crossings, size_reached
 

@@ -13,14 +13,13 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import FloatArray
+from ..arrays import FloatArray, one_of
 from ..certificates import Certificate, Verified, one_line, stability_check, stability_name
-from ..errors import ModelError, named_modes
+from ..errors import SHOWN, ModelError, named_modes
 from ..lti.statespace import StateSpace
 from ..plant.machine_plants import FigureInterval, PlantMachines, interval, interval_text
 from ..store import Value
 from ..tolerances import INTERVAL, TINY
-from ..words import SHOWN, one_of
 from .broken import axis_bandwidths, axis_sensitivities, moved_poles
 
 #: participation relative to the largest below which a mode is not named

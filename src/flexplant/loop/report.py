@@ -8,13 +8,12 @@ from typing import Literal
 
 import numpy as np
 
-from ..arrays import ComplexArray, FloatArray, whole
+from ..arrays import ComplexArray, FloatArray, mapping, whole
 from ..errors import LabelError, ModelError, aligned, counted, require_known, unknown_label
 from ..lti.frequency_sweep import ROUNDS, crossings, highest
 from ..plant.partitioned import NOT_JUDGED
 from ..store import Value
 from ..tolerances import SPLIT
-from ..words import mapping
 from .broken import BrokenLoop, crossing, error_sensitivity, inverted, reference_pair
 from .closed import ClosedLoop
 from .measured_loop import broken_count

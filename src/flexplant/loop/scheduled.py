@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import FloatArray, real_array
+from ..arrays import FloatArray, function, instance, members, real_array
 from ..errors import AssumptionError, LabelError, ModelError, counted, only_one
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant, StandardPlant
 from ..store import Value
-from ..words import function, instance, members
 from .blocks import with_known
 from .closed import ClosedLoop, close_loop
 

@@ -12,10 +12,9 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import ComplexArray, FloatArray, IntArray, whole
+from ..arrays import ComplexArray, FloatArray, IntArray, instance, name_list, several, whole
 from ..errors import LabelError, ModelError, ShapeError, short, unknown_label
 from ..tolerances import ROUNDING
-from ..words import instance, name_list, several
 from .equations import state_scale
 
 #: largest condition of eigenvectors whose residues are used

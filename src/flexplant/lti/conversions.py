@@ -8,10 +8,9 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 
-from ..arrays import FloatArray, between, positive, real_array
+from ..arrays import FloatArray, between, one_of, positive, real_array
 from ..errors import ModelError
 from ..tolerances import RANK, ROUNDING, SAME
-from ..words import one_of
 from .blocks_of_states import bilinear_matrices, trapezoidal
 from .sampling import held_exactly
 from .statespace import StateSpace, System, as_statespace

@@ -11,12 +11,21 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from ..arrays import ComplexArray, FloatArray, between, complex_array, positive, positive_array
+from ..arrays import (
+    ComplexArray,
+    FloatArray,
+    between,
+    complex_array,
+    known_units,
+    name_list,
+    positive,
+    positive_array,
+    signal_names,
+)
 from ..errors import LabelError, ModelError, ShapeError, counted, require_known, short
 from ..parallel import Progress, expect
 from ..store import Value, checked, rebuild
 from ..tolerances import SAME, TINY
-from ..words import known_units, name_list, signal_names
 from .blocks_of_states import chosen_pair, rows_of, short_list
 from .frequency_sweep import checked_freq as checked_freq
 from .frequency_sweep import default_freq as default_freq

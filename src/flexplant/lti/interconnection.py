@@ -8,10 +8,9 @@ import numpy as np
 import scipy.linalg as la
 from scipy.sparse import csgraph
 
-from ..arrays import ComplexArray, FloatArray, IntArray
+from ..arrays import ComplexArray, FloatArray, IntArray, inner_names, instance, name_list
 from ..errors import LabelError, ModelError, ShapeError, require_known, short
 from ..tolerances import ROUNDING
-from ..words import inner_names, instance, name_list
 from .blocks_of_states import (
     Matrices,
     block_matrix,

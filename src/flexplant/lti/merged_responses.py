@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import ComplexArray
+from ..arrays import ComplexArray, members
 from ..errors import LabelError, ModelError, some_names
 from ..tolerances import SAME
-from ..words import members
 from .frequency import Frf
 
 #: what measurements that are merged have in common

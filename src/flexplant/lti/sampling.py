@@ -11,11 +11,10 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 
-from ..arrays import ComplexArray, FloatArray, IntArray, divisor, positive, real_array
+from ..arrays import ComplexArray, FloatArray, IntArray, check_names, divisor, positive, real_array
 from ..errors import AssumptionError, ModelError, warn
 from ..store import rebuild
 from ..tolerances import CLOSE, SAME, TINY
-from ..words import check_names
 from .blocks_of_states import (
     block_diagonal,
     block_eigenvalues,

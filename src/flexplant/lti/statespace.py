@@ -17,12 +17,14 @@ from ..arrays import (
     IntArray,
     complex_array,
     divisor,
+    known_units,
+    mapping,
     positive,
     real_array,
+    signal_names,
 )
 from ..errors import FlexplantError, ModelError, ShapeError, counted, short
 from ..store import Value
-from ..words import known_units, mapping, signal_names
 from .blocks_of_states import (
     Channels,
     block_eigenvalues,

@@ -9,11 +9,10 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import FloatArray, positive, real_array
-from ..errors import ModelError, ShapeError, counted, require_known
+from ..arrays import FloatArray, known_units, one_of, positive, real_array
+from ..errors import ModelError, ShapeError, counted, require_known, with_unit
 from ..store import Value
 from ..tolerances import SPLIT, TYPED
-from ..words import known_units, one_of, with_unit
 from .response_solvers import Recursion, continuous_poles
 from .sampling import held_exactly
 from .statespace import StateSpace, System, as_statespace

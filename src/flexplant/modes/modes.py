@@ -13,6 +13,7 @@ from ..arrays import (
     ComplexArray,
     FloatArray,
     IntArray,
+    instance,
     positions,
     positive,
     real_array,
@@ -25,7 +26,6 @@ from ..store import Value, checked
 from ..structure.definite import signed_square
 from ..structure.rigid import Placed, relative_miss
 from ..tolerances import FOUR_DIGITS, MOST_STEPS, RESIDUAL, SAME
-from ..words import instance
 from .matching import calibration_of, pair_modes
 from .normal_forms import pole_pairs
 

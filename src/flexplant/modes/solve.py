@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..arrays import ComplexArray, FloatArray, divisor, positive
+from ..arrays import ComplexArray, FloatArray, divisor, instance, positive
 from ..certificates import Certificate, Verified
 from ..errors import ModelError, SolverError, counted, short, warn
 from ..labels import Place
@@ -32,7 +32,6 @@ from ..sparse.symmetric import (
 from ..structure import Damping, FEModel, ModalDamping
 from ..structure.definite import elastic_modes, signed, signed_root, signed_square
 from ..tolerances import MISSED, MOST_STEPS, NEGLIGIBLE, PRECISION, ROOT, ROUNDING, TINY
-from ..words import instance
 from .modes import Modes
 from .normal_forms import PROPORTIONAL, NormalForm, check_drag, normal_form
 from .sparse_modes import counted_modes

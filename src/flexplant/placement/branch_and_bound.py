@@ -11,12 +11,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arrays import FloatArray, between, whole
+from ..arrays import FloatArray, between, function, whole
 from ..errors import ModelError, warn
 from ..parallel import Progress, expect
 from ..store import checked
 from ..tolerances import ROUNDING
-from ..words import function
 from ..work import Work
 from .convex import Below, Branch, Convex, Groups, Quadratic, chosen_rows
 from .problem import ADVICE, Problem, Search, SearchResult, layouts_of

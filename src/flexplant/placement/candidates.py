@@ -8,14 +8,13 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from ..arrays import FloatArray
+from ..arrays import FloatArray, several
 from ..errors import LabelError, ModelError, require_known, short
 from ..plant import Actuator, SensorPort, StandardPlant, standard_plant
 from ..plant.origins import PlantChannel as PlantChannel
 from ..plant.partitioned import require_sampled
 from ..plant.scheduling import port_at, require_positions
 from ..tolerances import TYPED
-from ..words import several
 from .zones import Zone
 
 Port: TypeAlias = SensorPort | Actuator | PlantChannel

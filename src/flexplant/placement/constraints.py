@@ -11,11 +11,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_array
 
-from ..arrays import FloatArray, number, positive, whole
+from ..arrays import FloatArray, mapping, members, name_list, number, positive, whole
 from ..errors import LabelError, ModelError, short, some_names
 from ..store import Value, checked
 from ..tolerances import SAME, TINY
-from ..words import mapping, members, name_list
 from .candidates import Places
 from .convex import Branch, chosen_rows
 from .zones import Disc, Zone

@@ -10,11 +10,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray
-from ..errors import FlexplantError, ModelError, short
+from ..arrays import FloatArray, IntArray, function
+from ..errors import FlexplantError, ModelError, short, with_unit
 from ..plant import StandardPlant
 from ..store import Value, checked
-from ..words import function, with_unit
 from .candidates import Port, Side, sides_of, with_side
 
 

@@ -8,13 +8,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..arrays import CACHED, FloatArray, IntArray, divisor
+from ..arrays import CACHED, FloatArray, IntArray, divisor, one_of
 from ..errors import AssumptionError, ModelError
 from ..plant import SensorPort, StandardPlant
 from ..plant.realisation import ModalRealisation
 from ..store import checked
 from ..tolerances import FOUR_DIGITS, NEGLIGIBLE, RANK, ROOT, TINY
-from ..words import one_of
 from .candidates import Port
 from .convex import Below, Branch, Convex, ascended, safe
 from .criterion import Criterion, Scorer, by_size

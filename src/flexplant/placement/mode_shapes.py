@@ -9,13 +9,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..arrays import FloatArray, divisor
+from ..arrays import FloatArray, divisor, flag, instance
 from ..errors import InfeasibleError, ModelError
 from ..plant import SensorPort, StandardPlant
 from ..reduction import EffectiveIndependence
 from ..reduction.methods import SelectionCriterion
 from ..store import checked
-from ..words import flag, instance
 from ..work import Work
 from .candidates import Port
 from .criterion import Criterion, Scorer

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..arrays import FloatArray, positive
+from ..arrays import FloatArray, flag, instance, one_of, positive
 from ..errors import LabelError, ModelError, only_one, require_known, short
 from ..estimation import Filter, FixedLag, KalmanEstimator, Predictor, design_kalman
 from ..estimation.filter_models import poi_channels, sensors
@@ -20,7 +20,6 @@ from ..plant.machine_plants import interval
 from ..plant.partitioned import require_noise
 from ..store import checked
 from ..tolerances import INTERVAL
-from ..words import flag, instance, one_of
 from .candidates import Port, with_side
 from .convex import WorstRow, quadratic
 from .criterion import Criterion, OnBoth, OnPlant, Scorer

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import FloatArray, IntArray, positive, real_array, whole
-from ..errors import LabelError, ModelError, counted, short
+from ..arrays import FloatArray, IntArray, instance, positive, real_array, whole
+from ..errors import SHOWN, LabelError, ModelError, counted, short
 from ..lti.frequency import Quantity
 from ..plant import Sensor, StandardPlant
 from ..store import Value
-from ..words import SHOWN, instance
 from ..work import Work
 from .candidates import Port, Side, candidate_places, known_candidates, sampled_plant, with_side
 from .constraints import Constraint, all_of, constraint_rows, constraints_of

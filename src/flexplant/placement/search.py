@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import FloatArray, Rng, positive, whole
+from ..arrays import FloatArray, Rng, instance, name_list, positive, whole
 from ..errors import (
     InfeasibleError,
     LabelError,
@@ -23,7 +23,6 @@ from ..errors import (
 from ..fingerprints import fingerprint
 from ..plant import Actuator, StandardPlant
 from ..store import Value, checked
-from ..words import instance, name_list
 from ..work import Work
 from .branch_and_bound import Exchange
 from .candidates import (

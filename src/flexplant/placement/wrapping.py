@@ -12,13 +12,12 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import FloatArray
+from ..arrays import FloatArray, one_of
 from ..errors import AssumptionError, FlexplantError, LabelError, ModelError, counted, short
 from ..plant import StandardPlant
 from ..plant.scheduling import values_over
 from ..store import checked
 from ..tolerances import NEGLIGIBLE, TINY
-from ..words import one_of
 from .candidates import SIDES, Port, sampled_plant, side_of, sides_of, with_side
 from .convex import Below, Branch, Convex, Tangent, least_sum
 from .criterion import Criterion, Scorer, Wrapping

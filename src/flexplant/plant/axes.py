@@ -10,12 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import ComplexArray, FloatArray, divisor, positive
+from ..arrays import ComplexArray, FloatArray, divisor, name_list, positive
 from ..errors import AssumptionError, LabelError, ModelError, require_known, some_names
 from ..lti.statespace import StateSpace
 from ..store import Value
 from ..tolerances import KEPT_PLANTS, TYPED
-from ..words import name_list
 from .assumptions import axes_in_words
 from .building import rigid_shapes
 from .partitioned import Partition

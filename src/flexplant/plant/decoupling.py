@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import FloatArray, divisor
+from ..arrays import FloatArray, divisor, name_list
 from ..errors import AssumptionError, counted, require_known, some_names
 from ..lti.statespace import StateSpace
 from ..store import Value
 from ..tolerances import TYPED
-from ..words import name_list
 from .axes import DrivenAxes, apart, driven_axes, real_gain
 from .inverse import followed_at_rest
 from .partitioned import Partition

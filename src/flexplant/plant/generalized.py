@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import FloatArray
+from ..arrays import FloatArray, instance, name_list
 from ..errors import ModelError, require_known, short
 from ..labels import Place
 from ..lti.interconnection import append, series
 from ..lti.statespace import StateSpace, System, as_statespace, single_channel
-from ..words import instance, name_list
 from .assumptions import CheckedSystem
 from .building import at_rate
 from .moving import PositionMap, position_map

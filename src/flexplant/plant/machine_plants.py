@@ -12,13 +12,12 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from ..arrays import MOST_DRAWS, FloatArray, Rng, between, generator, whole
-from ..errors import AssumptionError, FlexplantWarning, ModelError, named_modes
+from ..errors import AssumptionError, FlexplantWarning, ModelError, in_unit, named_modes, with_unit
 from ..lti.statespace import as_statespace
 from ..store import Value
 from ..tolerances import INTERVAL
 from ..updating import FrfResidual
 from ..updating.machines import COUNT, Machines
-from ..words import in_unit, with_unit
 from .building import another_machine, noiseless, sampled
 from .forces import Actuator
 from .machine_draws import DrawnModes, MachineFamily, obstacle

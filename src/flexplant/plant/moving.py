@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import FloatArray, number, real_array
+from ..arrays import FloatArray, function, instance, number, real_array
 from ..errors import AssumptionError, LabelError, ModelError, only_one, short, unknown_label
 from ..store import Value
-from ..words import function, instance
 from .axes import real_gain
 from .building import P, changed_densities, wired
 from .decoupling import Decoupling, decouple

@@ -10,7 +10,7 @@ from typing import Any, Self, TypeGuard
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray, positive, real_array
+from ..arrays import FloatArray, IntArray, instance, mapping, name_list, positive, real_array
 from ..errors import (
     AssumptionError,
     FlexplantError,
@@ -28,7 +28,6 @@ from ..reduction import ReducedModel
 from ..store import Value
 from ..structure import FEModel
 from ..structure.rigid import Structure
-from ..words import instance, mapping, name_list
 from .origins import (
     ELSEWHERE,
     TYPE_THIS,

@@ -8,14 +8,13 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from ..arrays import FloatArray, positive, real_array
+from ..arrays import FloatArray, check_names, flag, positive, real_array
 from ..errors import LabelError, ModelError, require_known, short
 from ..labels import DIRECTIONS, Place
 from ..lti.frequency import PER_TIME, QUANTITIES, Quantity
 from ..lti.statespace import StateSpace, single_channel
 from ..store import Value
 from ..tolerances import TYPED
-from ..words import check_names, flag
 from .realisation import ModalRealisation
 from .scheduling import checked_moves
 

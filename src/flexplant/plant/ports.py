@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar
 
-from ..arrays import FloatArray
+from ..arrays import FloatArray, check_names, instance, members, name_list, several
 from ..errors import LabelError, ModelError, require_known, short
 from ..labels import DIRECTIONS, Place
 from ..lti.filters import pade
@@ -16,7 +16,6 @@ from ..lti.interconnection import series
 from ..lti.statespace import StateSpace
 from ..store import Value
 from ..structure.rigid import place_motion
-from ..words import check_names, instance, members, name_list, several
 from .forces import Actuator
 from .port import ForcePort, MeasuredRow, SensorPort, checked_port, motion_unit, observed
 from .realisation import ModalRealisation

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import ComplexArray, FloatArray, IntArray, positive
+from ..arrays import ComplexArray, FloatArray, IntArray, instance, positive
 from ..errors import ModelError, SolverError, warn
 from ..labels import Place
 from ..lti.blocks_of_states import block_diagonal
@@ -20,7 +20,6 @@ from ..store import Value, checked
 from ..structure import FEModel
 from ..structure.rigid import Structure as Structure
 from ..tolerances import SAME, TINY
-from ..words import instance
 
 T = TypeVar("T")
 

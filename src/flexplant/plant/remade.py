@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..arrays import instance, name_list
 from ..errors import LabelError, ModelError, require_known, some_names
 from ..lti.sampling import acting
 from ..lti.statespace import StateSpace
 from ..store import Value
 from ..tolerances import SAME
-from ..words import instance, name_list
 from .building import (
     PASS_PORTS,
     P,

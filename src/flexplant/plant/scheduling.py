@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import FloatArray, number, real_array, whole
+from ..arrays import FloatArray, instance, number, real_array, whole
 from ..errors import LabelError, ModelError, require_known, short
 from ..labels import Place
 from ..store import Value
 from ..tolerances import SAME, TYPED
-from ..words import instance
 
 #: points of a position that a mapping of them does not name
 _POINTS = 21

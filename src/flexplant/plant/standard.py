@@ -9,12 +9,11 @@ from typing import Any, TypeAlias
 
 import numpy.typing as npt
 
-from ..arrays import positive
+from ..arrays import flag, instance, positive
 from ..errors import LabelError, ModelError, require_known
 from ..labels import Place
 from ..lti.frequency import Frf
 from ..lti.statespace import System
-from ..words import flag, instance
 from .building import PASS_PORTS, continuous_plant, evaluation_plant, sampled
 from .generalized import GeneralizedPlant, Weighable
 from .machine_plants import PlantMachines, fitted_machines

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from ..arrays import ComplexArray, FloatArray, positive, real_array, whole
+from ..arrays import ComplexArray, FloatArray, instance, positive, real_array, whole
 from ..errors import ModelError, counted, warn
 from ..lti.frequency import Frf
 from ..lti.frequency import frequency_response as system_response
@@ -25,7 +25,6 @@ from ..parallel import Progress
 from ..reduction import ReducedModel
 from ..store import checked
 from ..structure import Damping, FEModel
-from ..words import instance
 from .building import port_rows
 from .ports import Ports
 from .realisation import Structure, none, plant_modes

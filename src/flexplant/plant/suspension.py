@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import ComplexArray, FloatArray, divisor, number, positive
+from ..arrays import ComplexArray, FloatArray, divisor, members, number, positive
 from ..errors import ModelError, counted
 from ..labels import Place
 from ..modes import Modes, normal_form
@@ -19,7 +19,6 @@ from ..sparse.symmetric import orthonormalised
 from ..store import Value, checked
 from ..structure import Damper, FEModel, Spring
 from ..tolerances import NEGLIGIBLE, SAME, SPLIT, TYPED
-from ..words import members
 from .port import checked_place, port_direction
 from .realisation import realise
 

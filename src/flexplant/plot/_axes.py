@@ -17,12 +17,11 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogFormatter, MaxNLocator
 
 from ..arrays import ComplexArray, FloatArray
-from ..errors import FlexplantError, ModelError, short
+from ..errors import FlexplantError, ModelError, in_unit, short
 from ..lti.frequency import Frf, frequency_response
 from ..lti.statespace import as_statespace
 from ..plant.port import place_directions
 from ..tolerances import TINY
-from ..words import in_unit
 from .coinciding_curves import widen_hidden
 
 #: number of points along a line that a legend must not cover

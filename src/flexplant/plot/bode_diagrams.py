@@ -9,11 +9,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MultipleLocator
 
-from ..arrays import ComplexArray, FloatArray, real_array
+from ..arrays import ComplexArray, FloatArray, name_list, real_array
 from ..errors import ModelError, require_known, short, unknown_label
 from ..lti.frequency import Frf
 from ..tolerances import ROUNDING
-from ..words import name_list
 from ._axes import (
     GREY,
     STYLES,

@@ -9,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 
-from ..errors import LabelError, ModelError, counted, short
+from ..arrays import instance, one_of
+from ..errors import LabelError, ModelError, counted, in_unit, short, with_unit
 from ..loop import ClosedLoop, ErrorBudget, Spectrum
 from ..simulation import ErrorMap, Response, exposure_errors
 from ..simulation.exposure import error_channels
-from ..words import in_unit, instance, one_of, with_unit
 from ._axes import (
     BLACK,
     BLUE,

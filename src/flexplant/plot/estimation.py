@@ -9,7 +9,7 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from ..arrays import FloatArray, between, positive, real_array
+from ..arrays import FloatArray, between, instance, mapping, name_list, positive, real_array
 from ..errors import ModelError, ShapeError
 from ..estimation import ConsistencyReport, Estimate, LagReport
 from ..estimation.consistency_tests import FEWEST
@@ -17,7 +17,6 @@ from ..estimation.error import row_of
 from ..estimation.innovations import lines_of
 from ..estimation.lag_report import PREDICTOR, SMOOTHER, STATIC
 from ..simulation import EstimatorComparison
-from ..words import instance, mapping, name_list
 from ._axes import (
     BLACK,
     BLUE,

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ..certificates import Certificate, Verified, one_line, stability_check, stability_name
-from ..errors import FlexplantError, ModelError, counted, short
+from ..errors import FlexplantError, ModelError, counted, short, with_unit
 from ..estimation import LagReport, consistency
 from ..identification import StabilisationDiagram
 from ..loop import ClosedLoop, ErrorBudget, LoopComparison, LoopFigures, compare_loops, report_loops
@@ -33,7 +33,6 @@ from ..store import Value, written
 from ..synthesis import Controller
 from ..tolerances import CHANCE
 from ..updating import Localisation, UpdateResult
-from ..words import with_unit
 from ._axes import (
     CHANNELS,
     STYLES,

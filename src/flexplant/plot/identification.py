@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 
-from ..arrays import ComplexArray, FloatArray
+from ..arrays import ComplexArray, FloatArray, instance
 from ..identification import IdentifiedModes, StabilisationDiagram
 from ..lti.frequency import Frf
-from ..words import instance
 from ._axes import (
     BLUE,
     GREY,

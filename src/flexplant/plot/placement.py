@@ -12,15 +12,14 @@ from matplotlib.colors import LogNorm
 from matplotlib.patches import Circle, Patch
 from matplotlib.patches import Rectangle as Box
 
-from ..arrays import FloatArray, IntArray, whole
-from ..errors import ModelError
+from ..arrays import FloatArray, IntArray, instance, whole
+from ..errors import ModelError, in_unit
 from ..placement import Disc, ParetoCurve, SensorMap
 from ..placement.candidates import candidate_places
 from ..placement.mode_shapes import shapes_of
 from ..placement.zones import Zone
 from ..plant import Ports, PositionMap, StandardPlant
 from ..tolerances import NEGLIGIBLE
-from ..words import in_unit, instance
 from ._axes import (
     BLUE,
     CYCLE,

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 
-from ..arrays import FloatArray, positive, real_array
+from ..arrays import FloatArray, instance, name_list, positive, real_array
 from ..errors import ModelError, require_known
 from ..loop import ClosedLoop
 from ..loop.blocks import references
@@ -17,7 +17,6 @@ from ..lti.statespace import StateSpace, as_statespace
 from ..lti.time_responses import decay_time
 from ..lti.time_responses import step as step_response
 from ..simulation import Response
-from ..words import instance, name_list
 from ._axes import (
     BLUE,
     GREY,

@@ -14,14 +14,13 @@ from matplotlib.transforms import ScaledTranslation
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from mpl_toolkits.mplot3d.proj3d import proj_transform
 
-from ..arrays import ComplexArray, FloatArray, IntArray, divisor, positive
-from ..errors import ModelError, counted
+from ..arrays import ComplexArray, FloatArray, IntArray, divisor, instance, positive
+from ..errors import ModelError, counted, in_unit
 from ..labels import DofSet
 from ..modes import Modes
 from ..plant import Ports
 from ..structure.model import FEModel
 from ..tolerances import TYPED
-from ..words import in_unit, instance
 from ._axes import (
     BLACK,
     GREY,

@@ -10,15 +10,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from ..arrays import ComplexArray, FloatArray
-from ..errors import ModelError, counted
+from ..arrays import ComplexArray, FloatArray, instance
+from ..errors import ModelError, counted, in_unit, with_unit
 from ..labels import DofSet
 from ..lti.frequency import Frf
 from ..tolerances import TINY
 from ..updating import Correlation, FrfResidual, Localisation, Residual, UpdateResult, correlate
 from ..updating.parameters import Parameter, PointParameter
 from ..updating.search import Objective
-from ..words import in_unit, instance, with_unit
 from ._axes import (
     BLUE,
     CYCLE,

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import FloatArray, IntArray, positive, whole
+from ..arrays import FloatArray, IntArray, positive, several, whole
 from ..errors import ModelError, ShapeError, SolverError, counted
 from ..modes.modes import Modes
 from ..modes.solve import solve_modes
@@ -17,7 +17,6 @@ from ..sparse.symmetric import dense, projected, unit_diagonal
 from ..store import checked
 from ..structure import FEModel, ModalDamping
 from ..tolerances import RANK, ROUNDING, SAME, TINY
-from ..words import several
 from .methods import ReductionMethod, labels_given, refused_partition
 from .projection import Solver, block, fe_model, projected_model
 from .reduced import ReducedModel

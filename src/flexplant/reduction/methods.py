@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import ComplexArray, FloatArray, positive, whole
+from ..arrays import ComplexArray, FloatArray, instance, name_list, positive, whole
 from ..errors import LabelError, ModelError, ShapeError, attempted, counted, some_names
 from ..labels import DofSet, Place
 from ..modes.modes import Modes, require_real
@@ -21,7 +21,6 @@ from ..store import Value, checked
 from ..structure import Damping, FEModel
 from ..structure.definite import refuse_unstable
 from ..tolerances import NEGLIGIBLE, TYPED
-from ..words import instance, name_list
 from .reduced import ReducedModel
 
 #: shapes at DOFs, real or complex

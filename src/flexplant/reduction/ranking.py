@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray, positive, real_array, whole
+from ..arrays import FloatArray, IntArray, name_list, positive, real_array, whole
 from ..errors import ModelError, aligned, counted
 from ..labels import Place
 from ..lti.balancing import hankel_values
@@ -17,7 +17,6 @@ from ..modes.modes import Modes
 from ..modes.statics import labels_of, places
 from ..store import Value, checked
 from ..structure.definite import refuse_unstable
-from ..words import name_list
 
 
 def peak_gains(omega: FloatArray, zeta: FloatArray) -> FloatArray:

@@ -10,7 +10,15 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import ComplexArray, FloatArray, IntArray, complex_array, positive, real_array
+from ..arrays import (
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    complex_array,
+    name_list,
+    positive,
+    real_array,
+)
 from ..errors import ModelError, counted
 from ..labels import DofSet, Place
 from ..modes.matching import calibration_of
@@ -24,7 +32,6 @@ from ..structure import FEModel
 from ..structure.definite import refuse_unstable, unstable_stiffness
 from ..structure.rigid import relative_miss, rigid_motions
 from ..tolerances import NEGLIGIBLE, RANK
-from ..words import name_list
 from .judging import ReductionQuality, quality_of
 from .ranking import ErrorBound
 

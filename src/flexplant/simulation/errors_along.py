@@ -14,8 +14,16 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import FloatArray, positive, real_array, whole
-from ..errors import AssumptionError, ModelError, SolverError, counted, require_known
+from ..arrays import FloatArray, flag, instance, name_list, positive, real_array, whole
+from ..errors import (
+    AssumptionError,
+    ModelError,
+    SolverError,
+    counted,
+    require_known,
+    sizes_of,
+    with_unit,
+)
 from ..loop import ClosedLoop, ScheduledLoop
 from ..lti.equations import solve_stein, symmetrised
 from ..lti.riccati import filter_dare
@@ -24,7 +32,6 @@ from ..plant import StandardPlant
 from ..plant.partitioned import require_noise
 from ..store import Value, checked
 from ..tolerances import SAME, TYPED
-from ..words import flag, instance, name_list, sizes_of, with_unit
 from .moving_machine import (
     MovingMachine,
     MovingPlant,

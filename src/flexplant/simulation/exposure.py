@@ -8,12 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import FloatArray, positive, real_array
+from ..arrays import FloatArray, instance, name_list, positive, real_array
 from ..errors import LabelError, ModelError, ShapeError, aligned, counted, require_known
 from ..loop import ClosedLoop, close_loop
 from ..plant import Poi, Ports
 from ..store import Value
-from ..words import instance, name_list
 from .response import (
     Numbers,
     Response,

@@ -9,7 +9,17 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ComplexArray, FloatArray, IntArray, divisor, real_array, whole
+from ..arrays import (
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    divisor,
+    flag,
+    instance,
+    name_list,
+    real_array,
+    whole,
+)
 from ..errors import AssumptionError, ModelError, counted, only_one, require_known, warn
 from ..loop import ClosedLoop, close_loop
 from ..loop.blocks import force_name
@@ -21,7 +31,6 @@ from ..plant.inverse import OfS, SlowZeros, at_rest, slow_zeros, solved
 from ..plant.port import DERIVATIVES, TERMS
 from ..store import Value
 from ..tolerances import SAME
-from ..words import flag, instance, name_list
 from .motion import SetPointProfile
 from .nonlinear_elements import Acts, split_elements, warn_beyond_ranges
 

@@ -9,10 +9,9 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import FloatArray, between, positive, positive_array, real_array
+from ..arrays import FloatArray, between, one_of, positive, positive_array, real_array
 from ..errors import ModelError, counted
 from ..store import Value
-from ..words import one_of
 from .motion import SetPointProfile, constant_snap, setpoint
 
 #: largest number of factors of a shaper; more would take too long

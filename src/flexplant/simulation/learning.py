@@ -7,13 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import MOST_DRAWS, FloatArray, positive, whole
-from ..errors import ModelError, counted, short
+from ..arrays import MOST_DRAWS, FloatArray, function, instance, positive, whole
+from ..errors import ModelError, counted, short, with_unit
 from ..loop import ClosedLoop, close_loop
 from ..loop.blocks import force_name
 from ..store import Value
 from ..tolerances import SAME
-from ..words import function, instance, with_unit
 from .feedforward import Feedforward, known_forces, term_numbers, tracked
 from .motion import SetPointProfile
 from .response import Response

@@ -9,11 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import FloatArray, positive, real_array
+from ..arrays import FloatArray, instance, positive, real_array
 from ..errors import ModelError, counted
 from ..store import Value
 from ..tolerances import RANK, TYPED
-from ..words import instance
 
 
 class Motion(NamedTuple):

@@ -8,14 +8,23 @@ from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 
-from ..arrays import ComplexArray, FloatArray, between, divisor, positive, real_array
+from ..arrays import (
+    ComplexArray,
+    FloatArray,
+    between,
+    divisor,
+    instance,
+    positive,
+    real_array,
+    several,
+    why_not_called,
+)
 from ..errors import AssumptionError, ModelError, require_known, short, warn
 from ..plant import StandardPlant, driven_axes
 from ..plant.axes import complex_gain, resting_frequency
 from ..plant.inverse import at_rest, followed_at_rest, solved
 from ..store import Value, checked
 from ..tolerances import NEGLIGIBLE
-from ..words import instance, several, why_not_called
 from .motion import SetPointProfile
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..arrays import ComplexArray, FloatArray, divisor, positive
+from ..arrays import ComplexArray, FloatArray, divisor, instance, positive
 from ..errors import CertificateError, ModelError, warn
 from ..loop import ClosedLoop, close_loop
 from ..loop.blocks import force_name
@@ -13,7 +13,6 @@ from ..plant import driven_axes
 from ..plant.axes import resting_frequency
 from ..plant.partitioned import require_sampled
 from ..tolerances import MISSED, NEGLIGIBLE
-from ..words import instance
 from .feedforward import design_feedforward, force_axes, known_forces, tracked
 from .motion import SetPointProfile
 from .sampled_runs import simulate

@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import FloatArray, positive
-from ..errors import ModelError, require_known
+from ..arrays import FloatArray, instance, positive
+from ..errors import ModelError, require_known, with_unit
 from ..loop import ClosedLoop
 from ..plant.partitioned import NOT_JUDGED
 from ..store import Value
 from ..tolerances import NEGLIGIBLE, SAME
-from ..words import instance, with_unit
 from .motion import SetPointProfile
 from .sampled_runs import known_inputs, named_references, simulate
 

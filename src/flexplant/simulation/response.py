@@ -8,13 +8,12 @@ from typing import TypeAlias
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray, positive, real_array
+from ..arrays import FloatArray, IntArray, check_names, known_units, name_list, positive, real_array
 from ..errors import ChannelError, ModelError, ShapeError, counted, some_names, unknown_label, warn
 from ..loop import ClosedLoop, Spectrum
 from ..plant.axes import idle_forces, opposing_part
 from ..store import Value
 from ..tolerances import TYPED
-from ..words import check_names, known_units, name_list
 
 #: one number, or one per run
 Numbers: TypeAlias = "float | FloatArray"

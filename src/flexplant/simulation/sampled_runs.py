@@ -11,11 +11,14 @@ import numpy.typing as npt
 from ..arrays import (
     MOST_DRAWS,
     FloatArray,
+    flag,
     generator,
+    instance,
     positive,
     real_array,
     seed_of,
     seed_sequence,
+    several,
     whole,
 )
 from ..errors import AssumptionError, ModelError, only_one, require_known, short, warn
@@ -28,7 +31,6 @@ from ..plant.building import white_noise
 from ..plant.partitioned import require_sampled
 from ..plant.port import DERIVATIVES
 from ..tolerances import SAME, TYPED
-from ..words import flag, instance, several
 from .motion import SetPointProfile
 from .moving_machine import MovingMachine, trajectory
 from .nonlinear_elements import Acting, Acts, split_elements, warn_beyond_ranges

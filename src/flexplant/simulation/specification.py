@@ -9,15 +9,14 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..arrays import FloatArray, positive
-from ..errors import AssumptionError, ModelError, aligned, only_one, require_known, short
+from ..arrays import FloatArray, instance, positive
+from ..errors import AssumptionError, ModelError, aligned, in_unit, only_one, require_known, short
 from ..loop import ClosedLoop, bandwidth
 from ..loop.other_machines import MODULUS_MARGIN
 from ..plant import FigureInterval
 from ..plant.machine_plants import PlantMachines, interval_text
 from ..store import Value, checked
 from ..tolerances import INTERVAL
-from ..words import in_unit, instance
 from .exposure import exposure_errors, settling_time
 from .response import Response
 

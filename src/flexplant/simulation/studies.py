@@ -12,8 +12,9 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import FloatArray, seed_sequence
+from ..arrays import FloatArray, instance, mapping, seed_sequence
 from ..errors import (
+    SHOWN,
     LabelError,
     ModelError,
     aligned,
@@ -30,7 +31,6 @@ from ..fingerprints import fingerprint
 from ..lti.statespace import StateSpace
 from ..parallel import Lost, Progress, one_thread, survived
 from ..store import Value
-from ..words import SHOWN, instance, mapping
 from ..work import Checkpoint
 from .response import Response
 

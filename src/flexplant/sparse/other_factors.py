@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..arrays import FloatArray
+from ..arrays import FloatArray, one_of
 from ..errors import SolverError
 from ..store import Value, checked
-from ..words import one_of
 from .factor import not_definite
 
 _ORDERS = ("default", "best", "amd", "metis", "nesdis")

@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..arrays import FloatArray, IntArray, floats_of, number, positive, real_array
+from ..arrays import FloatArray, IntArray, floats_of, instance, number, positive, real_array
 from ..errors import LabelError, ModelError
 from ..labels import DofSet, Interpolation, Place, checked_direction
 from ..store import Value, checked
-from ..words import instance
 
 
 def plain_place(at: Any, name: str) -> Any:

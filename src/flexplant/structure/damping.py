@@ -15,8 +15,10 @@ from ..arrays import (
     between,
     complex_array,
     divisor,
+    flag,
     positive,
     real_array,
+    several,
     whole,
 )
 from ..errors import ModelError, ShapeError, short
@@ -24,7 +26,6 @@ from ..sparse.factor import LARGEST_FULL
 from ..sparse.symmetric import dense
 from ..store import Value, checked
 from ..tolerances import ROUNDING
-from ..words import flag, several
 from .definite import elastic_modes
 
 

@@ -13,11 +13,19 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 import scipy.sparse as sp
 
-from ..arrays import CACHED, FloatArray, IntArray, positive, real_array, whole
+from ..arrays import (
+    CACHED,
+    FloatArray,
+    IntArray,
+    positive,
+    real_array,
+    several,
+    whole,
+    why_not_called,
+)
 from ..errors import LabelError, ModelError, ShapeError, require_known, short
 from ..labels import DofSet, Interpolation, node_dofs
 from ..tolerances import SAME
-from ..words import several, why_not_called
 
 #: one number, an array (nx, ny, ...) with one per element, or a function of an element's centre
 Field: TypeAlias = float | Sequence[Any] | FloatArray | Callable[..., float]

@@ -9,14 +9,13 @@ from typing import Any, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import FloatArray
+from ..arrays import FloatArray, one_of
 from ..errors import ModelError, counted, some_names
 from ..labels import DIRECTIONS, DofSet
 from ..parallel import Progress
 from ..sparse.symmetric import diagonal
 from ..store import Value
 from ..tolerances import SAME, TYPED
-from ..words import one_of
 from .check_facts import Facts, facts
 from .matrices import FEMatrices
 from .model import FEModel

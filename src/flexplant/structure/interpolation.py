@@ -8,12 +8,11 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray, positive, real_array
+from ..arrays import FloatArray, IntArray, instance, positive, real_array
 from ..errors import LabelError, ModelError, require_known
 from ..labels import DIRECTIONS, DofSet, Interpolation, direction_names
 from ..store import Value, checked
 from ..tolerances import SAME, TINY
-from ..words import instance
 from .model import FEModel
 
 #: number of nodes up to which one smooth interpolant is used; for more, the nearest nodes are used

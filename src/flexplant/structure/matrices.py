@@ -10,14 +10,24 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..arrays import FloatArray, IntArray, node_numbers, positive, real_array, whole
+from ..arrays import (
+    FloatArray,
+    IntArray,
+    flag,
+    instance,
+    name_list,
+    node_numbers,
+    one_of,
+    positive,
+    real_array,
+    whole,
+)
 from ..dof_columns import at_nodes
 from ..errors import LabelError, ModelError, ShapeError, counted, warn
 from ..labels import DofSet
 from ..sparse.factor import is_positive_definite
 from ..store import Value, checked
 from ..tolerances import SAME, TYPED
-from ..words import flag, instance, name_list, one_of
 from .definite import are_swapped, digits_of, square, symmetric_matrix
 from .model import FEModel
 from .singular_mass import empty_rows, held_rows, inertial

@@ -11,13 +11,12 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from ..arrays import FloatArray, Matrix, real_array
+from ..arrays import FloatArray, Matrix, instance, real_array
 from ..errors import ModelError, counted, warn
 from ..labels import DofSet
 from ..sparse.factor import is_positive_definite
 from ..sparse.symmetric import matrix_sum, orthonormalised, with_pattern_of
 from ..store import Value, frozen
-from ..words import instance
 from .attachments import HeldShape, Part, added_matrices
 from .damping import Damping, Rayleigh, damping_matrix
 from .definite import (

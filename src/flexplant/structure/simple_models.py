@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..arrays import FloatArray, IntArray, positive, positive_array, real_array
+from ..arrays import FloatArray, IntArray, one_of, positive, positive_array, real_array, several
 from ..errors import LabelError, ModelError, ShapeError, short
 from ..labels import DIRECTIONS, DofSet
 from ..store import frozen
-from ..words import one_of, several
 from .element_matrices import (
     beam_mass,
     beam_parts,

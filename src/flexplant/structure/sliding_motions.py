@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import FloatArray
+from ..arrays import FloatArray, name_list
 from ..errors import ModelError, require_known
 from ..sparse.factor import DENSE_LIMIT
 from ..sparse.symmetric import dense, unit_diagonal
 from ..tolerances import NULL
-from ..words import name_list
 from .model import FEModel
 
 

@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import FloatArray
+from ..arrays import FloatArray, inner_names
 from ..errors import AssumptionError, ModelError
 from ..lti.blocks_of_states import Matrices
 from ..lti.conversions import bilinear, image_freq, tustin
@@ -25,7 +25,6 @@ from ..lti.modal import modal_form
 from ..lti.statespace import StateSpace
 from ..store import Value
 from ..tolerances import RESIDUAL, ROUNDING, SPLIT, TINY
-from ..words import inner_names
 from .scaling import POINT, answers, balanced, departure_from_normal, loop_speed, normalised
 
 #: departure from normal above which modal coordinates are taken; the condition of their

@@ -16,8 +16,10 @@ from ..arrays import (
     FloatArray,
     below_half_rate,
     generator,
+    instance,
     positive,
     positive_array,
+    several,
     whole,
 )
 from ..dof_columns import Interpolation
@@ -37,7 +39,6 @@ from ..store import Value
 from ..structure import FEModel, ModalDamping, kirchhoff_plate, plate, solid_block
 from ..synthesis import design_servo
 from ..tolerances import SAME
-from ..words import instance, several
 
 #: the plate of the paper's Table 1, as its drawing says
 DRAWING: Mapping[str, Any] = {

@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import ComplexArray, FloatArray, IntArray, divisor
+from ..arrays import ComplexArray, FloatArray, IntArray, divisor, instance
 from ..errors import ModelError, counted, some_names
 from ..modes.matching import assigned
 from ..modes.modes import MeshError, measured_poles
 from ..sparse.factor import DENSE_LIMIT
 from ..store import Value
 from ..tolerances import CLOSE, DEVIATIONS, INTERVAL, MOST_STEPS, NEGLIGIBLE, SAME, TYPED
-from ..words import instance
 from .family import Point
 from .residuals.residual import USUAL, Bound, Eigenvalues, Kind, eigenvalue_sensitivities, growth
 from .search import Objective, SearchEnd

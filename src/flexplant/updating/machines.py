@@ -10,14 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import REFUSED, FloatArray, whole
+from ..arrays import REFUSED, FloatArray, instance, whole
 from ..errors import ModelError, counted
 from ..identification import MeasuredModes
 from ..modes import Modes
 from ..modes.matching import ALIKE
 from ..store import Value
 from ..tolerances import INTERVAL, ROUNDING, TINY, TYPED
-from ..words import instance
 from .parameters import AddedMass, Parameter, PointParameter
 from .residuals.residual import eigenvalue_sensitivities
 

@@ -12,7 +12,16 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..arrays import FloatArray, Matrix, element_mask, positive, real_array, whole
+from ..arrays import (
+    FloatArray,
+    Matrix,
+    element_mask,
+    function,
+    mapping,
+    positive,
+    real_array,
+    whole,
+)
 from ..errors import LabelError, ModelError, ShapeError, short
 from ..modes import solve_modes
 from ..reduction import ReducedModel
@@ -21,7 +30,6 @@ from ..sparse.symmetric import dense, projected
 from ..structure import FEModel, ModalDamping
 from ..structure.definite import elastic_modes
 from ..tolerances import SAME, TYPED
-from ..words import function, mapping
 from .parameters import MAKES, Derivatives, Parameter, checked_bounds, checked_text
 
 #: the matrices that parameters name

@@ -10,13 +10,12 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 import scipy.sparse as sp
 
-from ..arrays import FloatArray, Matrix, real_array
-from ..errors import LabelError, ModelError, ShapeError, require_known, short
+from ..arrays import FloatArray, Matrix, instance, real_array
+from ..errors import LabelError, ModelError, ShapeError, require_known, short, with_deviation
 from ..labels import DIRECTIONS, Place
 from ..reduction import ReducedModel
 from ..store import Value
 from ..structure import FEModel
-from ..words import instance, with_deviation
 
 #: advice for the function that builds a model
 MAKES = "Pass a function that returns an FEModel: lambda t: kirchhoff_plate(thickness=t, ...)."

@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 
 from ..arrays import MOST_DRAWS, ComplexArray, FloatArray, Rng, between, generator, positive, whole
-from ..errors import ModelError, attempted, counted, require_known, short, warn
+from ..errors import ModelError, attempted, counted, require_known, short, warn, with_deviation
 from ..identification import MeasuredModes
 from ..modes import MeshError, Modes, solve_modes
 from ..modes.matching import ALIKE, CLUSTER, in_span
 from ..sparse.factor import DENSE_LIMIT
 from ..store import Value
 from ..tolerances import INTERVAL
-from ..words import with_deviation
 from .discrepancy import USUAL_DOF, Discrepancy, ModalUncertainty, modal_uncertainty
 from .family import changed_model
 from .machines import COUNT, Machines, Trend, trend_of

@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import FloatArray, Rng, generator, positive, whole
+from ..arrays import FloatArray, Rng, flag, generator, instance, positive, whole
 from ..errors import FlexplantError, ModelError, counted, some_names, warn
 from ..parallel import Progress, expect
 from ..structure.model import FEModel
 from ..tolerances import CLOSE, MOST_STEPS, TINY, TYPED
-from ..words import flag, instance
 from .discrepancy import weigh_discrepancy
 from .family import changed_model, is_large
 from .full_basis import FullBasis

@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
-from ..arrays import FloatArray, whole
+from ..arrays import FloatArray, instance, whole
 from ..errors import FlexplantError, LabelError, ModelError
 from ..io import read_frf_csv, read_frf_mat, read_frf_npz, read_frf_uff, read_mat
 from ..lti.frequency import Frf
@@ -21,7 +21,6 @@ from ..plant import StandardPlant
 from ..simulation.motion import SetPointProfile
 from ..store import load
 from ..synthesis import LoopDesign
-from ..words import instance
 from .bench import Bench
 from .page import Page
 from .verdict import LoopLimits

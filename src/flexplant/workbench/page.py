@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import FlexplantError
+from ..errors import FlexplantError, in_unit
 from ..synthesis import LoopDesign, Notch, ShapedAxis
 from ..synthesis.laws.axis_law import MeasuredAxis
-from ..words import in_unit
 from .bench import Bench, DesignHistory, crossing_axis, first_axis
 from .consequences import PERIOD, Consequences, Tuning
 from .controls import ElementCards, Number, new_elements, parsed, with_new

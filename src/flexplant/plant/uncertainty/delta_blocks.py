@@ -8,13 +8,12 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ...arrays import whole
+from ...arrays import flag, whole
 from ...errors import ModelError, ShapeError, short
 from ...lti.blocks_of_states import block_matrix
 from ...lti.conversions import tustin
 from ...lti.statespace import StateSpace, as_statespace
 from ...store import Value, checked
-from ...words import flag
 
 #: random Deltas turn their phase between these multiples of the slowest and the fastest pole
 _PHASES = (0.1, 10.0)

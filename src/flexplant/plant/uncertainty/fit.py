@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...arrays import ComplexArray, FloatArray, positive
+from ...arrays import ComplexArray, FloatArray, members, positive, several
 from ...errors import LabelError, ModelError, require_known, short
 from ...identification import MeasuredModes
 from ...modes.matching import NEAR, assigned
@@ -16,7 +16,6 @@ from ...sparse.symmetric import dense
 from ...tolerances import CLOSE, DEVIATIONS, ROUNDING, SAME, TYPED
 from ...updating import Machines, ModalUncertainty, UpdateResult, eigenvalue_sensitivities
 from ...updating.parameters import Parameter
-from ...words import members, several
 from ..partitioned import Partition
 from ..realisation import ModalRealisation
 from .delta import Known, Uncertainty

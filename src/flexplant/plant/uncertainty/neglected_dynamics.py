@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ...arrays import ComplexArray, FloatArray, whole
+from ...arrays import ComplexArray, FloatArray, name_list, whole
 from ...errors import CertificateError, ModelError, counted
 from ...lti.conversions import image_freq
 from ...lti.frequency import frequency_response
@@ -18,7 +18,6 @@ from ...lti.modal import part_of
 from ...lti.statespace import StateSpace, System
 from ...store import Value
 from ...tolerances import NEGLIGIBLE, PRECISION, RANK, ROUNDING, TINY, TYPED
-from ...words import name_list
 from ..building import sampled_like
 from ..partitioned import Partition, is_plant
 

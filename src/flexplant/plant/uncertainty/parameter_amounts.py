@@ -9,14 +9,13 @@ from typing import Any, ClassVar
 import numpy as np
 import scipy.sparse as sp
 
-from ...arrays import FloatArray, positive
+from ...arrays import FloatArray, instance, positive
 from ...errors import ModelError
 from ...labels import Place
 from ...lti.frequency import QUANTITIES, Quantity
 from ...sparse.symmetric import dense, orthonormalised
 from ...tolerances import ROUNDING
 from ...updating.parameters import Parameter
-from ...words import instance
 from ..building import continuous_plant
 from ..machine_plants import MachineParts
 from ..partitioned import Partition

@@ -10,7 +10,7 @@ from typing import Any, Generic, Self
 import numpy as np
 import scipy.linalg as la
 
-from ...arrays import FloatArray, number
+from ...arrays import FloatArray, mapping, number
 from ...errors import ModelError, counted, require_known, some_names
 from ...identification import MeasuredModes
 from ...lti.interconnection import append, lft
@@ -18,7 +18,6 @@ from ...lti.statespace import StateSpace
 from ...store import Value
 from ...tolerances import DEVIATIONS
 from ...updating import Machines, ModalUncertainty, UpdateResult
-from ...words import mapping
 from ..building import P
 from ..machine_draws import DrawnModes
 from ..partitioned import Partition

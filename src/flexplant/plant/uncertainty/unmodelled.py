@@ -8,12 +8,11 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ...arrays import FloatArray
+from ...arrays import FloatArray, name_list
 from ...errors import ModelError, require_known, short
 from ...lti.conversions import bilinear, tustin
 from ...lti.riccati import filter_care
 from ...lti.statespace import StateSpace, single_channel
-from ...words import name_list
 from ..building import at_rate
 from ..partitioned import Partition
 from .delta import Uncertainty

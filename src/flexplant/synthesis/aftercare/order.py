@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ...arrays import FloatArray, positive, whole
+from ...arrays import FloatArray, instance, positive, whole
 from ...certificates import Certificate, Verified, stability, stability_check, stability_name
 from ...errors import CertificateError, FlexplantError, FlexplantWarning, ModelError
 from ...loop import close_loop
@@ -23,7 +23,6 @@ from ...lti.riccati import control_care, control_dare
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread
 from ...plant import AnyPlant, GeneralizedPlant, StandardPlant, plant_of
-from ...words import instance
 from ..controller import Controller, with_left_out
 
 

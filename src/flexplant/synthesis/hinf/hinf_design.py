@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...arrays import positive
+from ...arrays import instance, positive
 from ...certificates import Certificate, Verified, deferred
 from ...errors import CertificateError, ModelError, SolverError, counted, short
 from ...lti.interconnection import lft
@@ -18,7 +18,6 @@ from ...parallel import one_thread
 from ...plant import AnyPlant, StandardPlant, stage_weights
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...tolerances import NEGLIGIBLE
-from ...words import instance
 from ..controller import Controller, ReachedNorms, SolvedController, SynthesisMethod, certified_norm
 from ..pipeline import Design, Solution, designed, posed, solved, verified
 from ..preparation import Prepared, badly_scaled

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...arrays import FloatArray, number
+from ...arrays import FloatArray, mapping, number
 from ...certificates import Certificate, Verified
 from ...errors import CertificateError, ModelError, SolverError, attempted, counted
 from ...lti.frequency import frequency_response
@@ -21,7 +21,6 @@ from ...parallel import Progress, tick
 from ...plant import AnyPlant, StandardPlant, plant_of
 from ...plant.uncertainty.channels import with_channels
 from ...tolerances import FOUR_DIGITS, SAME
-from ...words import mapping
 from ..controller import Controller
 from ..pipeline import Design, Solution, solved, verified
 from ..preparation import prepared

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ...arrays import FloatArray, below_half_rate, positive
+from ...arrays import FloatArray, below_half_rate, inner_names, positive
 from ...certificates import Certificate, Verified, stability_check
 from ...errors import AssumptionError, CertificateError, ModelError, SolverError
 from ...loop import modulus_margin
@@ -22,7 +22,6 @@ from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread
 from ...plant import AnyPlant
 from ...tolerances import FOUR_DIGITS, TINY
-from ...words import inner_names
 from ..controller import Controller, required_stability
 from ..pipeline import Design, Solution, designed
 from ..preparation import Prepared, prepared

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...arrays import number, positive, real_array, whole
+from ...arrays import flag, instance, mapping, number, positive, real_array, whole
 from ...errors import AssumptionError, LabelError, ModelError, ShapeError, require_known, short
 from ...fingerprints import fingerprint
 from ...loop.measured_loop import static_map
@@ -18,7 +18,6 @@ from ...lti.interconnection import among
 from ...lti.statespace import StateSpace
 from ...plant.port import TERMS
 from ...store import Value, checked
-from ...words import flag, instance, mapping
 from .law import Axes, Law, LawElement, SingleElement, axes_controller, connected
 from .loop_design import DesignedLoops, axes_of, made
 

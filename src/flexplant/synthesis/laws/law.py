@@ -11,7 +11,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ...arrays import ComplexArray, FloatArray, below_half_rate, positive, real_array
+from ...arrays import (
+    ComplexArray,
+    FloatArray,
+    below_half_rate,
+    flag,
+    instance,
+    name_list,
+    positive,
+    real_array,
+)
 from ...errors import ModelError, require_known, short
 from ...lti.blocks_of_states import Matrices, block_matrix, cascaded, trapezoidal
 from ...lti.frequency import sampled_freq
@@ -20,7 +29,6 @@ from ...lti.response_solvers import responder
 from ...lti.statespace import StateSpace
 from ...plant import AnyPlant
 from ...store import Value
-from ...words import flag, instance, name_list
 
 
 class Section(NamedTuple):

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import FloatArray, between, positive
-from ...errors import ModelError
+from ...errors import ModelError, with_unit
 from ...loop.report import report_loops
 from ...loop.sensitivity_functions import bandwidth
 from ...lti.blocks_of_states import trapezoidal
@@ -18,7 +18,6 @@ from ...lti.response_solvers import continuous_poles, responses
 from ...lti.sampling import held_exactly
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...store import Value
-from ...words import with_unit
 from .controller_elements import Pid
 from .law import Section, tustin_s
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...arrays import FloatArray
+from ...arrays import FloatArray, name_list
 from ...errors import AssumptionError, ModelError, short
 from ...loop import ClosedLoop, close_loop
 from ...lti.conversions import bilinear, image_freq, tustin
@@ -22,7 +22,6 @@ from ...plant.uncertainty.delta_blocks import Block, FullBlock, RepeatedScalar, 
 from ...plant.uncertainty.neglected_dynamics import with_neglected
 from ...plant.uncertainty.sampled_channels import DeltaChannels, delta_channels
 from ...plant.uncertainty.uncertain_plants import UncertainPlant, made_of
-from ...words import name_list
 from .uncertainty_blocks import SAMPLES, Perturbation, realised_delta
 
 #: heights are taken this much above the weights at the frequencies that sample an interval

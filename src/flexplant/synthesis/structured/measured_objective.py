@@ -9,7 +9,7 @@ from numbers import Real
 
 import numpy as np
 
-from ...arrays import FloatArray, positive
+from ...arrays import FloatArray, name_list, positive
 from ...errors import ModelError, require_known, short
 from ...lti.conversions import tustin
 from ...lti.interconnection import lft
@@ -17,7 +17,6 @@ from ...lti.statespace import StateSpace
 from ...plant import AnyPlant
 from ...store import Value, checked
 from ...tolerances import TINY
-from ...words import name_list
 from .judges import STEP, Closed, Judge, Matrices, SmoothJudge, problem_on
 
 

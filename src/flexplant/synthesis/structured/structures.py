@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ...arrays import FloatArray, real_array, whole
+from ...arrays import FloatArray, flag, function, instance, name_list, real_array, whole
 from ...errors import ModelError, ShapeError, attempted, counted, require_known
 from ...lti.balancing import balanced
 from ...lti.blocks_of_states import Matrices as LawMatrices
@@ -19,7 +19,6 @@ from ...lti.riccati import control_care, filter_care
 from ...lti.statespace import StateSpace, System
 from ...plant import AnyPlant
 from ...store import Value, checked, rebuild
-from ...words import flag, function, instance, name_list
 from ..hinf.hinf_design import design_hinf
 from ..hinf.hinf_riccati import Riccati
 from ..laws.law import Law, LawElement, SingleElement, chained, decoupled

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from ...arrays import FloatArray
-from ...errors import counted
+from ...errors import SHOWN, counted
 from ...store import Value
 from ...tolerances import CLOSE, NEGLIGIBLE, TINY, TYPED
-from ...words import SHOWN
 from ..family import repeated_groups
 from ..parameters import Parameter, checked_parameters, checked_values
 from ..search import Objective, checked_residuals

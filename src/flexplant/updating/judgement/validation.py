@@ -10,12 +10,11 @@ import numpy as np
 import scipy.linalg as la
 
 from ...arrays import ComplexArray, FloatArray, Rng, between, complex_array, generator
-from ...errors import ModelError, ShapeError
+from ...errors import SHOWN, ModelError, ShapeError
 from ...identification import MeasuredModes
 from ...modes import matching
 from ...sparse.symmetric import dense
 from ...store import Value
-from ...words import SHOWN
 from ..family import Point
 from ..parameters import Parameter, checked_parameters
 from ..residuals.frf_residual import FrfResidual

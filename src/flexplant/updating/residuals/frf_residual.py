@@ -9,12 +9,20 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ...arrays import ComplexArray, FloatArray, divisor, positive, spread_array
+from ...arrays import (
+    ComplexArray,
+    FloatArray,
+    divisor,
+    flag,
+    instance,
+    one_of,
+    positive,
+    spread_array,
+)
 from ...errors import ModelError, counted, require_known, short, warn
 from ...labels import DIRECTIONS, Place
 from ...lti import Frf
 from ...lti.frequency import ORDERS
-from ...words import flag, instance, one_of
 from ..family import Family, Point
 from .point_residuals import Held
 from .residual import Bound, Kind, Residual, channel_places, place_rows, split_parts

@@ -10,14 +10,24 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ...arrays import ComplexArray, FloatArray, Matrix, divisor, positive, positive_array, whole
+from ...arrays import (
+    ComplexArray,
+    FloatArray,
+    Matrix,
+    divisor,
+    instance,
+    mapping,
+    positive,
+    positive_array,
+    several,
+    whole,
+)
 from ...errors import LabelError, ModelError, counted, short
 from ...identification import MeasuredModes
 from ...labels import Place
 from ...modes.matching import clusters
 from ...store import Value
 from ...tolerances import TYPED
-from ...words import instance, mapping, several
 from ..family import Eigen, Family, Point, repeated_groups
 from ..parameters import Parameter, checked_parameters, checked_values
 

@@ -9,13 +9,20 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ...arrays import ComplexArray, FloatArray, real_array, real_or_complex, spread_array
+from ...arrays import (
+    ComplexArray,
+    FloatArray,
+    flag,
+    instance,
+    real_array,
+    real_or_complex,
+    spread_array,
+)
 from ...errors import ModelError, ShapeError, counted, require_known
 from ...identification import MeasuredModes
 from ...labels import DIRECTIONS, Place
 from ...modes.matching import CLUSTER, assigned, clusters, mac_matrix
 from ...tolerances import SAME, TYPED
-from ...words import flag, instance
 from ..family import Family, Point
 from ..parameters import named_place
 from .residual import Bound, ModalResidual, channel_places, place_rows, split_parts

@@ -10,12 +10,11 @@ from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ...arrays import FloatArray, between, divisor, positive, whole
+from ...arrays import FloatArray, between, divisor, one_of, positive, whole
 from ...errors import ModelError, SolverError, counted
 from ...parallel import tick
 from ...store import Value, checked
 from ...tolerances import CLOSE, MISSED, NULL, SAME
-from ...words import one_of
 from ..family import Point
 from .objective import Objective
 

@@ -11,10 +11,9 @@ import numpy.typing as npt
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ...arrays import ComplexArray, FloatArray, divisor
-from ...errors import ModelError
+from ...arrays import ComplexArray, FloatArray, divisor, instance
+from ...errors import SHOWN, ModelError
 from ...tolerances import CHANCE, MISSED, NEGLIGIBLE, ROUNDING, SAME, TINY, TYPED
-from ...words import SHOWN, instance
 from ..family import Eigen, Family, Point, first_point, repeated_groups
 from ..parameters import Parameter
 from ..residuals.residual import Bound, BoundEigenvalues, Residual, mode_columns, splitting
