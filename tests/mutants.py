@@ -77,7 +77,7 @@ LINES = [
      "1.0 * gains[i]"),
     ("synthesis/hinf/ncf.py", "gain, B.T @ X, -D.T)",
      "gain, B.T @ X, D.T)"),
-    ("synthesis/laws/controller_elements.py", "float(np.sqrt(self.ratio))",
+    ("synthesis/laws/law.py", "float(np.sqrt(self.ratio))",
      "float(self.ratio)"),
     ("synthesis/aftercare/order.py", "(1.0 - loss) * before.margin",
      "0.0 * before.margin"),

@@ -27,7 +27,7 @@ from ..simulation import simulate
 from ..simulation.motion import SetPointProfile
 from ..store import load
 from ..synthesis import LoopDesign, ShapedAxis, tune_loops
-from ..synthesis.laws.law import axes_controller
+from ..synthesis.laws.loop_design import axes_controller
 from .evaluation import AxisLoop, BenchMachine
 
 #: duration of a step relative to the time of a crossover, and samples at most, a power of two

@@ -24,7 +24,8 @@ from ..lti.measured_lines import MeasuredPlant, low_slope
 from ..lti.response_solvers import Responder, remembered, responder
 from ..synthesis import LoopDesign
 from ..synthesis.laws.axis_law import MeasuredAxis
-from ..synthesis.laws.law import Axes, Law
+from ..synthesis.laws.law import Law
+from ..synthesis.laws.loop_design import Axes
 
 #: change from a peak to its neighbour, relative to the peak, above which fewer than four lines lie
 #: within the half-power width of a mode

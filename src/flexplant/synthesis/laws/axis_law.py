@@ -16,8 +16,7 @@ from ...loop.measured_loop import nyquist_count
 from ...lti.frequency_sweep import local_maxima
 from ...lti.measured_lines import FEWEST, MeasuredPlant, between_lines, steps_between
 from ...tolerances import DEVIATIONS, TINY
-from .controller_elements import LowPass, Notch, Pid
-from .law import Law, tustin_s
+from .law import Law, LowPass, Notch, Pid, tustin_s
 
 #: power of 1 / s of a mass's response
 _MASS = 2

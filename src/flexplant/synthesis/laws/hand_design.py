@@ -1,4 +1,4 @@
-"""LoopDesign: loops shaped by hand, element by element, and the script that makes them again."""
+"""LoopDesign: loops shaped by hand, given blocks included, and the script that makes them again."""
 
 from __future__ import annotations
 
@@ -10,16 +10,89 @@ from typing import Any
 import numpy as np
 
 from ...arrays import flag, instance, mapping, number, positive, real_array, whole
-from ...errors import AssumptionError, LabelError, ModelError, ShapeError, require_known, short
+from ...errors import (
+    AssumptionError,
+    LabelError,
+    ModelError,
+    ShapeError,
+    counted,
+    require_known,
+    short,
+)
 from ...fingerprints import fingerprint
 from ...loop.measured_loop import static_map
+from ...lti.conversions import bilinear
 from ...lti.frequency import Frf
 from ...lti.interconnection import among
-from ...lti.statespace import StateSpace
+from ...lti.statespace import StateSpace, as_statespace, single_channel
 from ...plant.port import TERMS
 from ...store import Value, checked
-from .law import Axes, Law, LawElement, SingleElement, axes_controller, connected
-from .loop_design import DesignedLoops, axes_of, made
+from ..controller import Controller
+from .law import BlockSection, Law, LawElement, SingleElement
+from .loop_design import Axes, DesignedLoops, axes_controller, axes_of, connected, made
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FixedBlock(SingleElement):
+    """An element of a law that is a given system with one input and one output.
+
+    Parameters
+    ----------
+    block : StateSpace
+        System from error to command, continuous or sampled. A sampled system with states can only
+        be used at its own rate.
+    label : str
+        Description that is shown when the law is printed.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.synthesis.FixedBlock(fx.lti.tf([1.0], [0.01, 1.0]), "shaping filter")
+    FixedBlock shaping filter: 1 state
+    """
+
+    block: StateSpace
+    label: str = "block"
+
+    def __post_init__(self) -> None:
+        block = single_channel(self.block, "a block of a law", ShapeError)
+        self._set(block=block, label=str(self.label))
+
+    @classmethod
+    def of(cls, given: Any, *, label: str = "") -> FixedBlock:
+        """Return the element that is a given system, or a designed controller.
+
+        Parameters
+        ----------
+        given : StateSpace or Controller
+            System of the element. A StateSpace is used unchanged, from error to command. A designed
+            Controller K includes the sign of the feedback (``u = K y``). The element is therefore
+            ``-K``.
+        label : str, optional
+            Description of the element; by default the name or the method of `given`.
+        """
+        if isinstance(given, Controller):
+            return cls(-given.system, label or given.method)
+        if isinstance(given, Value) and not isinstance(given, StateSpace):
+            raise ModelError(
+                f"a block of a law is a system, got {short(given)}. Pass a StateSpace."
+            )
+        return cls(as_statespace(given), label or getattr(given, "name", None) or "block")
+
+    def __repr__(self) -> str:
+        rate = f" at {1.0 / self.block.dt:g} Hz" if self.own_rate else ""
+        return f"FixedBlock {self.label}: {counted(self.block.n_states, 'state')}{rate}"
+
+    @property
+    def own_rate(self) -> float:
+        """The only rate [Hz] at which the block can run; 0 if it can run at any rate."""
+        return 1.0 / self.block.dt if self.block.dt and self.block.n_states else 0.0
+
+    @cached_property
+    def section(self) -> BlockSection:
+        """The system. A sampled block is replaced by its continuous equivalent by Tustin's rule."""
+        rate, g = self.own_rate, self.block
+        return BlockSection(bilinear(g, rate) if rate else g.replace(dt=0.0))
 
 
 @dataclass(frozen=True, eq=False, repr=False)

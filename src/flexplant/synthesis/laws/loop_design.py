@@ -8,20 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from ...arrays import FloatArray
+from ...arrays import FloatArray, name_list
 from ...errors import LabelError, ModelError, counted, require_known, short, warn
 from ...loop import LoopReport, ModeTolerances, SpillOver, in_axes, report_loops
 from ...loop.measured_loop import static_map
 from ...loop.sensitivity_functions import taken_apart
 from ...lti.frequency import Frf
-from ...lti.interconnection import series
+from ...lti.interconnection import series, side_by_side
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread
 from ...plant import AnyPlant, decouple
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...store import Value
 from ..controller import checked_loop, with_modes
-from .law import Axes, Law, LawElement, axes_controller, connected
+from .law import Law, LawElement
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -66,6 +66,47 @@ class DesignedLoops(Value):
         if self.tolerances is not None:
             lines.append(f"  {self.tolerances.summary}")
         return "\n".join([*lines, *(f"  {note}" for note in self.notes)])
+
+
+@dataclass(frozen=True)
+class Axes:
+    """A square plant in its axes, and the way there from y and from there to u."""
+
+    plant: Any
+    before: StateSpace
+    after: StateSpace
+    rate: float
+    given: AnyPlant | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The axes."""
+        return tuple(self.after.outputs)
+
+
+def axes_controller(axes: Axes, laws: Mapping[str, Law]) -> StateSpace:
+    """Return motions to commands of the axes, ``-diag(laws)``."""
+    dt = 1.0 / axes.rate if axes.rate else 0.0
+    each = [(-laws[name].system).replace(dt=dt) for name in axes.names]
+    return side_by_side(each, axes.names).replace(outputs=axes.before.inputs)
+
+
+def connected(axes: Axes, inner: StateSpace, references: Mapping[str, str]) -> StateSpace:
+    """Return [y, references] -> u of a controller in the axes."""
+    require_known("axis", references, axes.names)
+    names = name_list(references.values(), "references")
+    chosen = np.zeros((len(axes.names), len(names)))
+    for column, name in enumerate(references):
+        chosen[axes.names.index(name), column] = 1.0
+    none = np.zeros((len(axes.names), len(axes.after.inputs)))
+    if len(inner.inputs) > len(axes.names):
+        read = np.block([[none, chosen], [axes.after.D, np.zeros(chosen.shape)]])
+    else:
+        read = np.hstack([axes.after.D, -chosen])
+    inputs = [*axes.after.inputs, *names]
+    first = StateSpace([], [], [], read, inner.dt, inputs=inputs)
+    system = series(series(first, inner), axes.before.replace(dt=inner.dt))
+    return system.replace(inputs=inputs, outputs=axes.before.outputs)
 
 
 def axes_of(

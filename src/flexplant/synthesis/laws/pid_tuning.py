@@ -18,8 +18,7 @@ from ...lti.response_solvers import continuous_poles, responses
 from ...lti.sampling import held_exactly
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...store import Value
-from .controller_elements import Pid
-from .law import Section, tustin_s
+from .law import Pid, Section, tustin_s
 
 #: where integral action ends and where the lead is centred, as fractions of the crossover: from a
 #: plant that lags anyway (1) to one that needs all available phase (30); lead of 0 to 67 deg

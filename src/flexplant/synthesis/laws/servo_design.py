@@ -16,7 +16,7 @@ from ...loop import ClosedLoop
 from ...loop.blocks import drives, driving_blocks
 from ...loop.other_machines import growing_modes, modes_in_words, warn_of_critical
 from ...lti.frequency_sweep import resonance_grid
-from ...lti.interconnection import loop_poles
+from ...lti.interconnection import loop_poles, series, side_by_side
 from ...lti.minimal_realisations import minimal
 from ...lti.statespace import StateSpace
 from ...parallel import one_thread
@@ -25,8 +25,7 @@ from ...plant.axes import DrivenAxes, driven_axes, elastic
 from ...plant.partitioned import require_sampled
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ..controller import CLOSE, Controller, with_checks
-from .controller_elements import Notch
-from .law import Axes, axes_controller, connected
+from .law import Notch
 from .servo_loops import (
     LEADS,
     POWERS,
@@ -459,15 +458,15 @@ class ServoTask:
 
     def controller(self, law: ServoLaw) -> StateSpace:
         """Return a law as a system from [refs, readings] to u."""
-        reads = tuple(self.reading.reads.values())
-        read = {self.reading.reads[name]: ref for name, ref in self.reading.references.items()}
-        before = StateSpace([], [], [], law.driven.T, inputs=reads, outputs=self.plant.u)
-        after = StateSpace([], [], [], np.eye(len(reads)), inputs=reads, outputs=reads)
-        axes = Axes(None, before, after, self.rate)
-        each = zip(reads, law.axes, law.level, strict=True)
-        laws = {name: axis.law(law.notches) / level for name, axis, level in each}
-        system = connected(axes, axes_controller(axes, laws), read)
-        system = system.select(inputs=[*read.values(), *reads])
+        reads, followed = tuple(self.reading.reads.values()), self.reading.references
+        each = zip(law.axes, law.level, strict=True)
+        laws = side_by_side([(axis.law(law.notches) / k).system for axis, k in each], reads)
+        direct = np.eye(len(reads))
+        referred = direct[:, [reads.index(self.reading.reads[name]) for name in followed]]
+        errors, inputs = np.hstack([referred, -direct]), [*followed.values(), *reads]
+        before = StateSpace([], [], [], errors, laws.dt, inputs=inputs)
+        after = StateSpace([], [], [], law.driven.T, laws.dt, inputs=reads, outputs=self.plant.u)
+        system = series(series(before, laws), after)
         return system.replace(name="servo", units=self.plant.units)
 
     @cached_property

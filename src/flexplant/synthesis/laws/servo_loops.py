@@ -30,8 +30,7 @@ from ...lti.statespace import StateSpace
 from ...plant import EvaluationModel, Foreign, StandardPlant
 from ...plant.axes import DrivenAxes, complex_gain, force_units, oscillations
 from ...tolerances import KEPT_PLANTS
-from .controller_elements import Integrator, LowPass, Notch, Pid
-from .law import Law, decoupled, product, tustin_s
+from .law import Integrator, Law, LowPass, Notch, Pid, decoupled, product, tustin_s
 
 #: the lead of a mass line: its zero lies this factor below the bandwidth, its pole above. With 4
 #: |S| of a free mass peaks near 4 dB with the roll-off and integrator of `design_servo`. Where a

@@ -24,10 +24,9 @@ from ...plant.axes import real_gain
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...tolerances import SPLIT
 from .axis_law import AxisLaw, MeasuredAxis, linear_step, near_lowest
-from .controller_elements import Pid
 from .joint_plants import Coupling, JointPlant, Worst
-from .law import Axes, Law, tustin_s
-from .loop_design import DesignedLoops, axes_of, made
+from .law import Law, Pid, tustin_s
+from .loop_design import Axes, DesignedLoops, axes_of, made
 from .pid_tuning import tune_pid
 from .servo_loops import TARGET
 
