@@ -67,7 +67,7 @@ LINES = [
      "/ cost"),
     ("modes/matching.py", "** 2 / divisor(sizes)",
      "/ divisor(sizes)"),
-    ("modes/statics.py", "response = response - phi @",
+    ("modes/solve.py", "response = response - phi @",
      "response = response - 0.0 * phi @"),
     ("joining/frf_coupling.py", "between, weighted.conj())",
      "between, weighted)"),

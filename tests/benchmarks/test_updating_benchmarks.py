@@ -12,7 +12,7 @@ from bridges import FILE, Bridge, ends, noisy_fits
 from flexplant.errors import FlexplantWarning
 from flexplant.identification import MeasuredModes
 from flexplant.modes import solve_modes
-from flexplant.modes.statics import stiffness_factor
+from flexplant.modes.sparse_modes import stiffness_factor
 from flexplant.reduction import DesiredDofs, reduce, select_dofs
 from flexplant.structure import ModalDamping, PointMass, kirchhoff_plate
 from flexplant.updating import AddedMass, Eigenvalues, ModeShapes, localise, update

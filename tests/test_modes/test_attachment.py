@@ -7,7 +7,7 @@ import scipy.sparse as sp
 import oracles_structure as oracle
 from flexplant.errors import LabelError, ModelError
 from flexplant.modes import solve_modes, static_response
-from flexplant.modes.statics import attachment_vectors
+from flexplant.modes.solve import attachment_vectors
 from flexplant.structure import FEModel, ModalDamping, Rayleigh
 from plates import make_plate
 

@@ -8,7 +8,7 @@ import pytest
 import flexplant as fx
 import oracles_joining as oracle
 from flexplant.errors import FlexplantWarning, ModelError, SolverError
-from flexplant.modes import normal_form, solve, statics
+from flexplant.modes import complex_modes, normal_form, solve, sparse_modes
 
 PLATE = {"thickness": 0.0272, "density": 2702, "youngs_modulus": 70e9, "poisson_ratio": 0.35}
 
@@ -36,7 +36,7 @@ def machine(region):
 @pytest.mark.parametrize("region", [False, True])
 def test_complex_modes_of_a_large_model(region, monkeypatch):
     model = machine(region)
-    for module in (solve, statics):  # a dense solution is the reference
+    for module in (solve, sparse_modes):  # a dense solution is the reference
         monkeypatch.setattr(module, "DENSE_LIMIT", 100)
     found = fx.solve_modes(model, count=16)
     assert np.iscomplexobj(found.phi)
@@ -77,7 +77,8 @@ def test_overdamped_motions_are_set_apart(rate, slow, monkeypatch):
     at_dampers = model.dofs.where(box=[(0.29, -1, -1), (0.31, 1, 1)]).labels
     rom = fx.reduce(model, fx.reduction.CraigBampton(at_dampers, 30))
     for is_large in (False, True):
-        monkeypatch.setattr(solve, "is_large", lambda model, large=is_large: large)
+        for module in (solve, complex_modes):
+            monkeypatch.setattr(module, "is_large", lambda model, large=is_large: large)
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
             modes = fx.solve_modes(model, count=8)
@@ -97,11 +98,11 @@ def test_overdamped_motions_are_set_apart(rate, slow, monkeypatch):
 
 
 def test_what_is_not_found_is_refused(monkeypatch):
-    for module in (solve, statics):
+    for module in (solve, sparse_modes):
         monkeypatch.setattr(module, "DENSE_LIMIT", 100)
     model = machine(False)
     with pytest.raises(ModelError, match="take no attachment vectors"):
         fx.solve_modes(model, count=8, compliance_at="low/1:z")
-    monkeypatch.setattr(solve, "MOST_STEPS", 2)
+    monkeypatch.setattr(complex_modes, "MOST_STEPS", 2)
     with pytest.raises(SolverError, match="complex modes leave a relative residual"):
         fx.solve_modes(model, count=8)

@@ -10,7 +10,7 @@ import scipy.sparse as sp
 import oracles_modes as oracle
 from flexplant import DofSet, check
 from flexplant.errors import ModelError
-from flexplant.modes import solve, solve_modes, statics
+from flexplant.modes import solve, solve_modes, sparse_modes
 from flexplant.structure import FEModel, Spring, beam, definite, kirchhoff_plate
 
 ALUMINIUM = {"density": 2702, "youngs_modulus": 70e9, "poisson_ratio": 0.35}
@@ -94,7 +94,7 @@ def test_a_stiff_grounding_spring_is_a_support(factor):
 )
 def test_soft_springs_beside_extended_precision(stiffness, route, monkeypatch):
     if route == "sparse":
-        for module in (solve, statics):
+        for module in (solve, sparse_modes):
             monkeypatch.setattr(module, "DENSE_LIMIT", 100)
         monkeypatch.setattr(solve, "_DENSE_MANY", 100)
     model = suspended(plate((10, 8)), stiffness)

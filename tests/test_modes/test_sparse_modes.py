@@ -10,9 +10,7 @@ import meshes
 from flexplant import DofSet
 from flexplant.errors import ModelError
 from flexplant.modes import sparse_modes as counted
-from flexplant.modes import statics
-from flexplant.modes.sparse_modes import counted_modes
-from flexplant.modes.statics import modes_below, stiffness_factor
+from flexplant.modes.sparse_modes import counted_modes, modes_below, stiffness_factor
 from flexplant.sparse import ordering
 from flexplant.sparse.lowest import BlockLanczos
 from flexplant.structure import FEModel
@@ -104,9 +102,9 @@ def test_below_a_frequency(structure, monkeypatch, single):
     model = FEModel(model.M, model.K, dofs=model.dofs)  # without a factor in use
     i = 9 + int(np.argmax(np.diff(expected[9:14])))
     top = 0.5 * (expected[i] + expected[i + 1])
-    made, solve = [], statics.StiffnessFactor.solve
+    made, solve = [], counted.StiffnessFactor.solve
     monkeypatch.setattr(
-        statics.StiffnessFactor, "solve", lambda *args: made.append(1) or solve(*args)
+        counted.StiffnessFactor, "solve", lambda *args: made.append(1) or solve(*args)
     )
     if single:
         monkeypatch.setattr(ordering, "_COSTLY", 0.0)
@@ -180,7 +178,7 @@ def test_a_search_in_single_precision(structure, monkeypatch, soft):
     monkeypatch.setattr(counted, "_search", recorded)
     monkeypatch.setattr(ordering, "_COSTLY", 0.0)
     if r < 6:  # far below the modes of the plate: it does not suffice
-        monkeypatch.setattr(statics, "_SINGLE_SHIFT", -1e8)
+        monkeypatch.setattr(counted, "_SINGLE_SHIFT", -1e8)
     squares, phi, certificate = counted_modes(model, 12)
     assert_modes_of(model, squares, phi, expected)
     assert certificate["counted"] == certificate["found"]

@@ -17,7 +17,7 @@ from ..certificates import Certificate, Verified
 from ..errors import CertificateError, ModelError, counted, warn
 from ..labels import DIRECTIONS, DofSet
 from ..lti import Frf
-from ..modes.statics import static_response
+from ..modes.solve import static_response
 from ..reduction import ReducedModel
 from ..sparse.factor import DENSE_LIMIT, LARGEST_FULL
 from ..sparse.symmetric import dense, orthonormalised

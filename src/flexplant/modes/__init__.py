@@ -35,6 +35,6 @@ from .modes import Modes as Modes
 from .normal_forms import NormalForm as NormalForm
 from .normal_forms import normal_form as normal_form
 from .solve import solve_modes as solve_modes
-from .statics import static_response as static_response
+from .solve import static_response as static_response
 
 __dir__ = _public_names(__name__)

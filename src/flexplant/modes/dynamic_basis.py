@@ -17,9 +17,10 @@ from ..sparse.symmetric import beyond, dense, projected
 from ..structure import Damping, FEModel, ModalDamping, Rayleigh
 from ..structure.definite import signed_root, unstable_stiffness
 from ..tolerances import CLOSE, MISSED, MOST_STEPS, NULL, SAME, SETTLED, SPLIT, TINY, TYPED
+from .complex_modes import damper_forces
 from .modes import Modes
-from .solve import damper_forces
-from .statics import StiffnessFactor, dissection_of, held_factor, static_response
+from .solve import static_response
+from .sparse_modes import StiffnessFactor, dissection_of, held_factor
 
 #: number of loads above which the second static response of each load is left out
 _MANY = 30

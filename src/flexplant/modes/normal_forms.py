@@ -11,7 +11,7 @@ import scipy.linalg as la
 import scipy.sparse as sp
 
 from ..arrays import ComplexArray, FloatArray, IntArray, Matrix, divisor, real_array, whole
-from ..errors import ModelError, SolverError, counted
+from ..errors import ModelError, SolverError, counted, warn
 from ..sparse.symmetric import dense, orthonormalised
 from ..store import Value
 from ..structure.definite import elastic_modes, signed_square
@@ -114,6 +114,15 @@ class NormalForm(Value):
     @property
     def _unstable(self) -> slice:
         return slice(self.n_rigid, self.n_rigid + self.decaying.size)
+
+
+def overdamped_notes(form: NormalForm, rate: float) -> tuple[str, ...]:
+    """Warn of overdamped poles up to `rate` [1/s]; return the note, empty if there are none."""
+    note = form.overdamped_below(rate)
+    if not note:
+        return ()
+    warn(note)
+    return (note,)
 
 
 def normal_form(

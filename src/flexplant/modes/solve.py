@@ -1,49 +1,38 @@
-"""The eigenvalue problem of a structure (paper, eq. (2)), solved and checked."""
+"""Modes of a structure (paper, eq. (2)) and its static responses, solved and checked."""
 
 from __future__ import annotations
 
 import weakref
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..arrays import ComplexArray, FloatArray, divisor, instance, positive
+from ..arrays import FloatArray, Matrix, divisor, instance, positive
 from ..certificates import Certificate, Verified
-from ..errors import ModelError, SolverError, counted, short, warn
-from ..labels import Place
+from ..errors import ModelError, SolverError, counted, short
+from ..labels import DofSet, Place
 from ..parallel import Progress
 from ..sparse.factor import DENSE_LIMIT
 from ..sparse.lowest import STEPS
 from ..sparse.other_factors import Cholmod
 from ..sparse.symmetric import (
     Absolute,
-    beyond,
     by_rows,
     column_groups,
     dense,
     diagonal,
-    projected,
     rounding_of,
     width_of,
 )
 from ..structure import Damping, FEModel, ModalDamping
 from ..structure.definite import elastic_modes, signed, signed_root, signed_square
-from ..tolerances import MISSED, MOST_STEPS, NEGLIGIBLE, PRECISION, ROOT, ROUNDING, TINY
+from ..tolerances import NEGLIGIBLE, PRECISION, ROOT, ROUNDING, SAME
+from .complex_modes import coupled_modes, is_proportional, is_rayleigh, wider
 from .modes import Modes
-from .normal_forms import PROPORTIONAL, NormalForm, check_drag, normal_form
-from .sparse_modes import counted_modes
-from .statics import (
-    attachment_vectors,
-    is_large,
-    labels_of,
-    modes_below,
-    places,
-    projected_zeta,
-    stiffness_factor,
-)
+from .sparse_modes import counted_modes, is_large, modes_below, stiffness_factor
 
 #: least number of elastic modes in the basis of responses
 _FEW = 6
@@ -172,8 +161,8 @@ def solve_modes(
             Verified("rigid_residual", rigid_residual(model), route),
             Verified("rigid_rounding", float(np.sqrt(held) / (2 * np.pi)), route),
         )
-    if damping is None and model.D is not None and not _is_proportional(model, omega, phi):
-        return _coupled_modes(model, phi, kept, top, names, factor)
+    if damping is None and model.D is not None and not is_proportional(model, omega, phi):
+        return coupled_modes(model, phi, kept, top, names, factor)
     inside = np.flatnonzero(signed_square(omega) <= top)[:kept]
     if inside.size < omega.size:
         omega, phi, residual = omega[inside], phi[:, inside], residual[inside]
@@ -296,49 +285,6 @@ def _undamped(
     return np.concatenate([np.zeros(r), omega]), shapes, certificate
 
 
-def _is_proportional(model: FEModel, omega: FloatArray, phi: FloatArray) -> bool:
-    """Return whether the kept modes are modes of the damped model too."""
-    D: Any = model.D
-    r = model.rigid_body.shape[1]
-    check_drag(phi[:, :r], D, omega[r:])
-    forces = np.asarray(D @ phi[:, r:])
-    rate = np.sum(phi[:, r:] * forces, axis=0)
-    # all of D phi, not only its projection on the kept modes, since D may couple to truncated modes
-    stray = forces - np.asarray(model.M @ phi[:, r:]) * rate
-    coupling = np.linalg.norm(stray / np.sqrt(diagonal(model.M))[:, None], axis=0)
-    largest = float(np.max(diagonal(D) / diagonal(model.M), initial=0.0))
-    return bool(np.all(coupling <= PROPORTIONAL * largest))
-
-
-def _coupled_modes(
-    model: FEModel,
-    phi: FloatArray,
-    count: int,
-    top: float,
-    names: tuple[str, ...],
-    factor: Cholmod | None,
-) -> Modes:
-    if names:
-        raise ModelError(
-            "the model's D is not proportional: its modes are complex and take no attachment "
-            "vectors. Pass damping=ModalDamping(...) in place of D, or leave out compliance_at."
-        )
-    if is_large(model):
-        return damped_modes(model, phi, count, top, factor)
-    form = normal_form(
-        model.M,
-        model.D,
-        model.K,
-        model.rigid_body,
-        lambda: model.body_motions,
-        lowest=max(count - model.rigid_body.shape[1], 0),
-    )
-    omega = form.omega
-    keep = np.flatnonzero(signed_square(omega) <= top)[:count]
-    found = Modes(omega[keep], form.zeta[keep], form.phi[:, keep], model.dofs, form.n_rigid)
-    return leaving_overdamped(form, found, top)
-
-
 #: largest error of M-orthonormality of a result
 _ORTHONORMAL = ROUNDING
 #: residual ||K phi - omega^2 M phi||, of omega^2 ||M phi|| and of || |K| |phi| ||
@@ -422,146 +368,152 @@ def rigid_residual(model: FEModel) -> float:
     return float(np.max(np.linalg.norm(K @ R, axis=0) / divisor(whole)))
 
 
-#: additional undamped modes as a fraction and at least; and factor on the end of a band
-_MORE, _LEAST, _BEYOND = 4, 8, 1.3
+def places(at: Place | Iterable[Place], name: str = "a place") -> tuple[Place, ...]:
+    """Return one place, or several, as a tuple."""
+    if isinstance(at, str | Mapping):
+        return (at,)
+    try:
+        listed: list[Any] = list(at)
+    except TypeError as error:
+        raise _no_place(at, name) from error
+    numbers = [item for item in listed if np.ndim(item) == 0 and not isinstance(item, str)]
+    odd = [item for item in numbers if not isinstance(item, Mapping | int | float | np.number)]
+    if odd:
+        raise _no_place(odd[0], name)
+    if listed and all(
+        np.ndim(item) == 0 and not isinstance(item, str | Mapping) for item in listed
+    ):
+        return (listed,)
+    return tuple(listed)
 
 
-def wider(count: int, top: float, n: int) -> tuple[int, float]:
-    """Return the number of undamped modes in a basis of complex ones, and the last omega^2."""
-    return min(n, count + max(count // _MORE, _LEAST)), top * _BEYOND**2
-
-
-def damped_modes(
-    model: FEModel, phi: FloatArray, count: int, top: float, method: Cholmod | None
-) -> Modes:
-    """Return the complex modes of a large model, from a basis that grows until they converge."""
-    # Rayleigh-Ritz in real vectors V: the undamped modes, the static responses to the forces of
-    # dampers, and `(K - sigma M)^-1` times what the complex modes leave in `(lambda^2 M + lambda D
-    # + K) x = 0`, again and again (Davidson's method for the quadratic problem), until their
-    # residuals are as small as those allowed for undamped modes [Sleijpen1996]_
-    factor, r = stiffness_factor(model, method), model.rigid_body.shape[1]
-    V = np.hstack([phi, beyond(model.M, phi, factor.solve(damper_forces(model)))])
-    for _ in range(MOST_STEPS):
-        form, keep = _ritz(model, V, r, count, top)
-        shapes: Any = V @ form.phi[:, keep]
-        slow = np.abs(form.overdamped) <= _range(form.poles[keep], top)
-        still = V @ form.overdamped_phi[:, slow]
-        poles, every = form.poles[keep], _growing(form, shapes, keep)
-        rest, size, limit = _rest(
-            model, np.concatenate([poles, form.overdamped[slow]]), np.hstack([every, still]), r
-        )
-        wrong = np.flatnonzero(size > limit)
-        if not wrong.size:
-            part = np.where(limit > 0, size / divisor(limit), 0.0)
-            return leaving_overdamped(
-                form,
-                Modes(
-                    form.omega[keep],
-                    form.zeta[keep],
-                    shapes,
-                    model.dofs,
-                    n_rigid=r,
-                    residual=_RESIDUAL[0] * part[: keep.size],
-                    certificate=Certificate((Verified("basis", float(V.shape[1])),)),
-                ),
-                top,
-            )
-        step = factor.solve(np.hstack([rest[:, wrong].real, rest[:, wrong].imag]))
-        more = beyond(by_rows(model.M), V, step, dependent=MISSED)
-        if not more.shape[1]:
-            break
-        V = np.hstack([V, more])
-    worst = float((size[wrong] / limit[wrong]).max()) * _RESIDUAL[0]
-    raise SolverError(
-        f"complex modes leave a relative residual of {worst:.2g} (limit {_RESIDUAL[0]:g}) after "
-        f"{counted(V.shape[1], 'vector')}: the damping is strong. Want fewer modes, or reduce the "
-        "model by CraigBampton at the dampers, which keeps D, and take its modes()."
+def _no_place(given: object, name: str) -> ModelError:
+    return ModelError(
+        f"{name} must be a DOF label, a point (x, y, z) or a mapping of these to weights, got "
+        f"{short(given)}. Name it, such as '41:z', or several in a list."
     )
 
 
-def _ritz(
-    model: FEModel, V: FloatArray, r: int, count: int, top: float
-) -> tuple[NormalForm, np.ndarray]:
-    M, D, K = (projected(part, V) for part in (model.M, model.D, model.K))
-    # rounding of stiff shapes would act as a spring on rigid-body motions
-    K[:r], K[:, :r] = 0.0, 0.0
-    rigid = np.eye(V.shape[1], r)
-    body = V.T @ np.asarray(model.M @ model.body_motions) if model.n_unstable else rigid
-    form = normal_form(M, D, K, rigid, lambda: body, lowest=max(count - r, 0))
-    return form, np.flatnonzero(signed_square(form.omega) <= top)[:count]
+def place_of(place: Place) -> str:
+    """Return a short text for a place."""
+    if isinstance(place, str):
+        return place
+    if isinstance(place, Mapping):
+        return " + ".join(f"{weight:g} {label}" for label, weight in place.items())
+    return "(" + ", ".join(f"{float(x):g}" for x in place) + ")"
 
 
-def leaving_overdamped(form: NormalForm, modes: Modes, top: float = np.inf) -> Modes:
-    """Return modes up to omega^2 with a note of the real poles there, and warn of these."""
-    note = form.overdamped_below(_range(modes.poles, top))
-    if not note:
-        return modes
-    warn(note)
-    return modes.replace(notes=(*modes.notes, note))
+def attachment_vectors(
+    model: FEModel, phi: FloatArray, at: Sequence[Place]
+) -> tuple[FloatArray, FloatArray]:
+    """Return residual attachment vectors (n, m) and their frequencies (m,) [rad/s]."""
+    # the static response to a unit load at each place (free structures accelerate as rigid bodies
+    # under it: inertia relief), less the part that the modes give; then made M-orthogonal to the
+    # modes, mass-normalised, and diagonal in K among each other
+    M, K = model.M, model.K
+    loads = np.column_stack([model.dofs.row(place) for place in at])
+    response = static_response(model, loads)
+    whole = np.sum(loads * response, axis=0)
+    for _ in range(2):
+        response = response - phi @ (phi.T @ np.asarray(M @ response))
+    left = np.sum(loads * response, axis=0)
+    for place, part, total in zip(at, left, whole, strict=True):
+        if not part > SAME * total:
+            raise ModelError(
+                f"the {phi.shape[1]} modes already hold all of the static compliance at "
+                f"{place_of(place)} ({part:.2g} of {total:.3g} m/N is left): an attachment vector "
+                "there adds nothing. Leave it out of compliance_at, or keep fewer modes."
+            )
+    response = response / np.sqrt(left)
+    gram = response.T @ np.asarray(M @ response)
+    size = np.sqrt(np.diag(gram))
+    lowest = la.eigvalsh(gram / np.outer(size, size))[0]
+    # squared: vectors with an angle below 1e-5 count as one
+    if lowest < 1e-10:
+        raise ModelError(
+            f"the attachment vectors of {', '.join(place_of(place) for place in at)} depend on "
+            f"each other (least eigenvalue {lowest:.2g} of their Gram matrix): is a place twice?"
+        )
+    squares, mix = la.eigh(response.T @ np.asarray(K @ response), gram)
+    vectors = response @ mix
+    vectors = vectors - phi @ (phi.T @ np.asarray(M @ vectors))
+    return signed(vectors), np.sqrt(squares)
 
 
-def _range(poles: ComplexArray, top: float) -> float:
-    """Return the largest rate [1/s] of wanted poles: from omega^2, or from the modes."""
-    return float(np.sqrt(top) if np.isfinite(top) else np.abs(poles).max(initial=0.0))
+def static_response(model: Any, loads: FloatArray) -> FloatArray:
+    """Return the elastic static response (n, m) to loads, M-orthogonal to the rigid-body motions.
+
+    The equation is ``K u = f - M R R^T f``, with the M-orthonormal rigid-body motions R (n, r). The
+    term ``M R R^T f`` is the inertia force of the rigid-body acceleration that the load f causes.
+    The right-hand side is therefore in equilibrium. A large model is solved with its sparse
+    factorisation. A small model is held at r DOFs that prevent its rigid-body motions. The forces
+    at these supports are zero because of the equilibrium.
+
+    Parameters
+    ----------
+    model : FEModel
+        Model, or any object with the attributes M, K and rigid_body.
+    loads : (n, m) array
+        Forces on the DOFs [N, N m], a column for each case.
+
+    Returns
+    -------
+    (n, m) array [m, rad]
+        Displacements and rotations u, a column for each case.
+
+    Raises
+    ------
+    ModelError
+        When K has a motion without energy that is not a rigid-body motion.
+
+    Examples
+    --------
+    Two opposite forces compress the spring between two free masses:
+
+    >>> import numpy as np
+    >>> import flexplant as fx
+    >>> model = fx.chain(masses=[1.0, 1.0], stiffnesses=[4e5])
+    >>> fx.modes.static_response(model, np.array([[1.0], [-1.0]])).ravel().round(9).tolist()
+    [1.25e-06, -1.25e-06]
+    """
+    if is_large(model):
+        return stiffness_factor(model).static(loads)
+    M, rigid = model.M, model.rigid_body
+    balanced = loads - np.asarray(M @ (rigid @ (rigid.T @ loads)))
+    n, r = rigid.shape
+    held = np.zeros(n, dtype=bool)
+    if r:
+        # in units of sqrt(energy), so that rotations and displacements compare
+        weighted = np.sqrt(diagonal(M))[:, None] * rigid
+        held[la.qr(weighted.T, mode="economic", pivoting=True)[2][:r]] = True
+    free = np.flatnonzero(~held)
+    stiffness = dense(model.K)[np.ix_(free, free)]
+    size = np.sqrt(np.diag(stiffness))[:, None]
+    try:
+        factor = la.cho_factor(stiffness / size / size.T)
+    except la.LinAlgError as error:
+        raise ModelError(
+            f"K is singular beyond the {counted(r, 'rigid-body motion')} of the geometry (a "
+            "mechanism, a DOF without stiffness, or wrong coordinates), so that the static "
+            "response does not exist."
+        ) from error
+    response = np.zeros_like(balanced)
+    response[free] = la.cho_solve(factor, balanced[free] / size) / size
+    for _ in range(2):
+        response = response - rigid @ (rigid.T @ np.asarray(M @ response))
+    return np.asarray(response, dtype=np.float64)
 
 
-def _growing(form: NormalForm, shapes: Any, keep: np.ndarray) -> Any:
-    """Return shapes; for an unstable mode, the shape of the growing pole."""
-    unstable = form.omega[keep] < 0
-    return np.where(unstable, shapes.real + shapes.imag, shapes) if unstable.any() else shapes
+def projected_zeta(D: Matrix | None, vectors: FloatArray, omega: FloatArray) -> FloatArray:
+    """Return the damping ratio (m,) of each vector for a damping matrix D."""
+    if D is None or not omega.size:
+        return np.zeros(omega.size)
+    rate = np.sum(vectors * np.asarray(D @ vectors), axis=0)
+    return np.asarray(rate / (2 * np.abs(omega)), dtype=np.float64)
 
 
-def _rest(
-    model: FEModel, poles: ComplexArray, x: Any, n_rigid: int
-) -> tuple[ComplexArray, FloatArray, FloatArray]:
-    """Return the residuals (n, k) of modes, their size (k,) and their limit (k,)."""
-    K, M, D = by_rows(model.K), by_rows(model.M), by_rows(model.D)
-    inertia = (M @ x) * poles**2
-    rest = inertia + (D @ x) * poles + K @ x
-    stiff = diagonal(model.K)
-    weight = 1 / np.sqrt(np.where(stiff > 0, stiff, stiff.max(initial=0.0) or 1.0))[:, None]
-    size = np.linalg.norm(weight * rest, axis=0)
-    # an entry of a shape has the rounding error of the largest entries, as in undamped modes
-    moved = np.abs(x)
-    moved = moved + NEGLIGIBLE * moved.max(axis=0)
-    whole = Absolute(K) @ moved + np.abs(poles) * (Absolute(D) @ moved)
-    limit = _RESIDUAL[0] * np.linalg.norm(weight * inertia, axis=0)
-    # real poles are not returned: their approximate place suffices
-    part = np.where(poles.imag == 0, _RESIDUAL[0], _RESIDUAL[1])
-    limit = limit + part * np.linalg.norm(weight * whole, axis=0)
-    size[:n_rigid] = 0.0  # zero by convention; rigid-body modes are checked as undamped modes
-    return np.asarray(rest), np.asarray(size), np.asarray(limit)
-
-
-#: largest number of DOFs at which dampers act, and of their forces; above it D is material damping
-_TOUCHED, _FORCES = 600, 200
-
-
-def damper_forces(model: FEModel) -> FloatArray:
-    """Return orthonormal forces (n, m) that span those of dampers."""
-    # empty where D is a combination of K and M, or acts at so large a number of DOFs that it is
-    # material damping
-    none = np.zeros((model.n_dof, 0))
-    if model.D is None or is_rayleigh(model):
-        return none
-    rows = sp.csr_array(model.D)
-    touched = np.flatnonzero(np.diff(rows.indptr))
-    if touched.size > _TOUCHED:
-        return none
-    values, vectors = la.eigh(rows[touched][:, touched].toarray())
-    kept = np.flatnonzero(values > ROUNDING * values.max(initial=0.0))
-    if kept.size > _FORCES:
-        return none
-    forces = np.zeros((model.n_dof, kept.size))
-    forces[touched] = vectors[:, kept]
-    return forces
-
-
-def is_rayleigh(model: FEModel) -> bool:
-    """Return whether ``D = alpha M + beta K``, seen on one vector."""
-    x = np.random.default_rng(0).standard_normal(model.n_dof) / np.sqrt(diagonal(model.K) + TINY)
-    sides: Any = [np.asarray(part @ x) for part in (model.M, model.K)]
-    basis = np.column_stack([side / np.linalg.norm(side) for side in sides])
-    damped = np.asarray(model.D @ x)  # type: ignore[operator]
-    left = damped - basis @ np.linalg.lstsq(basis, damped)[0]
-    return bool(np.linalg.norm(left) <= ROUNDING * np.linalg.norm(damped))
+def labels_of(at: Sequence[Place], dofs: DofSet) -> tuple[str, ...]:
+    """Return the names of places, after checking that the model has them."""
+    for place in at:
+        dofs.row(place)
+    return tuple(place_of(place) for place in at)

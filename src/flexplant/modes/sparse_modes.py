@@ -1,35 +1,53 @@
-"""The lowest modes of a large sparse structure, with a count that shows that all are found."""
+"""The lowest modes of a large sparse structure: its factors, and a count that all are found."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import weakref
 from functools import partial
 from typing import Any
 
 import numpy as np
-import scipy.linalg as la
+import scipy.sparse as sp
 
-from ..arrays import COLUMNS, FloatArray, IntArray, Matrix, Rng
+from ..arrays import FloatArray, Rng, divisor
 from ..certificates import Certificate, Verified
-from ..errors import ModelError, SolverError, counted
-from ..parallel import expect, one_thread, tick
-from ..sparse.factor import LARGEST_FULL
-from ..sparse.lowest import BLOCK, EXTRA, STEPS, BlockLanczos, along_basis, iterated
-from ..sparse.other_factors import Cholmod
-from ..sparse.symmetric import SPREAD, Absolute, by_rows, column_groups, rayleigh_ritz, rounding_of
-from ..structure.definite import are_rigid, check_stiffness
-from ..structure.model import FEModel
-from ..tolerances import MOST_STEPS, NULL, PRECISION, ROOT
-from .statics import (
-    CountingFactor,
-    StiffnessFactor,
-    counting_factor,
-    dissection_of,
-    modes_below,
-    search_factor,
-    stiffness_factor,
+from ..errors import ModelError, SolverError, attempted, counted
+from ..parallel import expect, one_thread
+from ..sparse.davidson import BlockDavidson
+from ..sparse.factor import DENSE_LIMIT, LARGEST_FULL, MultifrontalFactor
+from ..sparse.lowest import (
+    BLOCK,
+    EXTRA,
+    BlockLanczos,
+    iterated,
+    multifrontal_inertia,
+    signed_factor,
 )
+from ..sparse.ordering import Dissection, dissect
+from ..sparse.other_factors import Cholmod, CholmodCholesky
+from ..sparse.symmetric import (
+    Absolute,
+    by_rows,
+    column_groups,
+    rayleigh_ritz,
+    rounding_of,
+    same_pattern,
+)
+from ..structure.definite import are_rigid, check_stiffness, unstable_stiffness
+from ..structure.model import FEModel
+from ..tolerances import MOST_STEPS, NULL, PRECISION, ROOT, ROUNDING, TINY
 
+#: shift in units of the rounding of rigid-body energies: far below the first elastic mode of nearly
+#: all models, and K - sigma M is still well-conditioned
+_SHIFT = -3e3
+#: the same in single precision: the lowest elastic modes of a bulky structure lie above it, or not
+#: far below, and K - sigma M stays definite in spite of rounding
+_SINGLE_SHIFT = -30.0
+#: cache of the factors of models that are in use
+_held: weakref.WeakKeyDictionary[FEModel, weakref.ref[StiffnessFactor]] = (
+    weakref.WeakKeyDictionary()
+)
+_dissected: weakref.WeakKeyDictionary[FEModel, Dissection] = weakref.WeakKeyDictionary()
 #: relative distance of omega^2 below which values form one group
 _GAP = ROOT
 #: cost of a mode in multiplications, per DOF and per entry of the factor: measured on solids and
@@ -44,6 +62,178 @@ _ROUNDINGS = 10.0
 #: many copies of a mode appear late, since each search begins with the remainder of the previous
 #: one
 _PARTS = (1.0, *[0.03] * 5)
+
+
+class StiffnessFactor:
+    """``K - sigma M = L L^T`` of a sparse model, with sigma just below zero.
+
+    Made by `stiffness_factor`, which returns the same object as long as it is in use.
+    """
+
+    def __init__(
+        self, model: FEModel, method: Cholmod | None = None, *, single: bool = False
+    ) -> None:
+        self.M: Any = sp.csc_array(model.M)
+        self.K: Any = sp.csc_array(model.K)
+        self.rigid = model.rigid_body
+        # use motions, not single DOFs: a DOF may have almost no inertia
+        near = self.sigma = _SHIFT * float(np.max(rounding_of(self.K, model.body_motions)))
+        self.single = single
+        if single:
+            self.sigma *= _SINGLE_SHIFT / _SHIFT * (np.finfo(np.float32).eps / np.finfo(float).eps)
+        elif model.n_unstable:  # below the lowest eigenvalue
+            self.sigma += 2.0 * float(unstable_stiffness(self.K, model.body_motions)[0])
+        shifted = _shift_matrix(self.K, self.M, self.sigma)
+        self.dissection = dissection_of(model)
+        try:
+            self._cholesky: MultifrontalFactor | CholmodCholesky = (
+                MultifrontalFactor(shifted, self.dissection, single=single)
+                if method is None
+                else method.factored(shifted)
+            )
+        except SolverError as error:
+            if single:
+                raise
+            negative = multifrontal_inertia(_shift_matrix(self.K, self.M, near), self.dissection)
+            if not negative:
+                raise
+            raise ModelError(
+                f"K has {counted(negative, 'negative eigenvalue')}: the structure is "
+                "unstable, and not as a rigid body. Look for a sign in K."
+            ) from error
+
+    def __repr__(self) -> str:
+        # four or eight bytes each
+        size = self._cholesky.n_entries * (4e-9 if self.single else 8e-9)
+        return f"<StiffnessFactor: {counted(self.K.shape[0], 'DOF')}, {size:.2g} GB>"
+
+    def solve(self, force: FloatArray) -> FloatArray:
+        """Return ``(K - sigma M)^-1 force`` for (n,) or (n, m) forces."""
+        return self._cholesky.solve(force)
+
+    def static(self, loads: FloatArray) -> FloatArray:
+        """Return the elastic static response (n, m) to loads, M-orthogonal to rigid-body motions.
+
+        ``K u = f - M R R^T f`` (inertia relief) by conjugate gradients, preconditioned with the
+        factor: a few steps, since sigma is small.
+        """
+        R = self.rigid
+        inertia = np.asarray(self.M @ R)
+        residual = loads - inertia @ (R.T @ loads)
+        wanted = np.linalg.norm(residual, axis=0)
+        u = np.zeros_like(residual)
+        direction, old = np.zeros_like(residual), np.ones(residual.shape[1])
+        best = np.full(residual.shape[1], np.inf)
+        for _ in range(60):
+            moved = self.solve(residual)
+            moved -= R @ (inertia.T @ moved)
+            new = np.sum(residual * moved, axis=0)
+            direction = moved + direction * (new / old)
+            force = np.asarray(self.K @ direction)
+            stored = np.sum(direction * force, axis=0)
+            length = np.divide(new, stored, out=np.zeros_like(new), where=stored > 0)
+            step = direction * length
+            u += step
+            residual -= force * length
+            residual -= inertia @ (R.T @ residual)
+            # error measured as energy: among forces, the rounding of stiff directions would hide
+            # the rest
+            part = np.sqrt(new * length / np.maximum(np.sum(u * (self.K @ u), axis=0), TINY))
+            if np.all((part <= ROUNDING) | (wanted == 0)) or np.all(part >= best):
+                break
+            best, old = part, divisor(new)
+        # tolerance in energy: shapes built from the response keep at least ten digits
+        if not np.all((part <= 1e-7) | (wanted == 0)):
+            raise SolverError(
+                f"a static response did not converge (relative last step {part.max():.1g}): K is "
+                f"singular beyond the {counted(R.shape[1], 'rigid-body motion')} of the "
+                "geometry. "
+                "Look for a mechanism, a DOF without stiffness, or wrong coordinates."
+            )
+        return u - R @ (inertia.T @ u)
+
+
+class CountingFactor:
+    """``K - sigma M = L D L^T`` in single precision, sigma above the modes that are wanted.
+
+    One factor counts the modes below sigma and is what their search needs [Grimes1994]_. Get it
+    from `counting_factor`.
+    """
+
+    single = True
+
+    def __init__(self, signed: MultifrontalFactor, sigma: float) -> None:
+        self._signed, self.sigma, self.below = signed, sigma, signed.negative
+
+    def solve(self, force: FloatArray) -> FloatArray:
+        """Return ``(K - sigma M)^-1 force`` for (n, m) forces, to single precision."""
+        return self._signed.solve(force)
+
+
+def counting_factor(model: FEModel, square: float) -> CountingFactor | None:
+    """Return the factor at omega^2 = `square` of a bulky stable model, else None."""
+    order = dissection_of(model)
+    if not order.is_costly or model.n_unstable:
+        return None
+    signed = signed_factor(_shift_matrix(sp.csc_array(model.K), model.M, square), order)
+    return None if signed is None else CountingFactor(signed, square)
+
+
+def stiffness_factor(model: FEModel, method: Cholmod | None = None) -> StiffnessFactor:
+    """Return the factor of a sparse model, the same one as long as it is in use."""
+    known = _held.get(model)
+    factor = known() if known is not None else None
+    if factor is None:
+        factor = StiffnessFactor(model, method)
+        _held[model] = weakref.ref(factor)
+    return factor
+
+
+def is_large(model: Any) -> bool:
+    """Return whether a model is sparse, and factored as such."""
+    large: bool = model.M.shape[0] > DENSE_LIMIT
+    return large and sp.issparse(model.K) and sp.issparse(model.M)
+
+
+def held_factor(model: FEModel) -> StiffnessFactor | None:
+    """Return the factor of a large sparse model, in use as long as it is held; else None."""
+    return stiffness_factor(model) if is_large(model) else None
+
+
+def search_factor(model: FEModel, method: Cholmod | None = None) -> StiffnessFactor:
+    """Return a factor to search modes with: the one in use, or one in single precision."""
+    known, order = _held.get(model), dissection_of(model)
+    unused = known is None or known() is None
+    if unused and method is None and not model.n_unstable and order.is_costly:
+        with attempted("a factor in single precision", SolverError):
+            return StiffnessFactor(model, single=True)
+    return stiffness_factor(model, method)
+
+
+def dissection_of(model: FEModel) -> Dissection:
+    """Return the elimination order of a model's matrices, found once."""
+    found = _dissected.get(model)
+    if found is None:
+        M, K = sp.csc_array(model.M), sp.csc_array(model.K)
+        # the pattern of both matrices: entries that cancel in one stay in the other
+        pattern = K if same_pattern(K, M) else sp.csc_array(abs(K) + abs(M))
+        found = dissect(pattern, model.dofs.node_index, model.dofs.xyz)
+        _dissected[model] = found
+    return found
+
+
+def modes_below(model: FEModel, square: float, *, single: bool = True) -> int:
+    """Return how many modes, rigid-body ones included, have an omega^2 below `square` (Sturm)."""
+    # without `single`, single precision is skipped, since it failed before
+    shifted = _shift_matrix(model.K, model.M, square)
+    return multifrontal_inertia(shifted, dissection_of(model), single=single)
+
+
+def _shift_matrix(K: Any, M: Any, square: float) -> Any:
+    """Return ``K - square M``, its indices those of K where both have the same."""
+    if not same_pattern(K, M):
+        return sp.csc_array(K - square * M)
+    return sp.csc_array((K.data - square * M.data, K.indices, K.indptr), shape=K.shape)
 
 
 @one_thread()
@@ -273,107 +463,3 @@ def _gap_below(squares: FloatArray, count: int, rounding: FloatArray) -> tuple[i
     before = max(float(squares[first - 1]), 0.0) if first else 0.0
     apart = squares[first] - before > closest and first < count
     return first, 0.5 * (before + float(squares[first])) if apart else 0.0
-
-
-#: number of steps that use M times the last block in place of residuals
-_FIRST = 10
-#: residual relative to ||K phi|| at which an eigenvalue is accepted: its error is of second order
-_VALUE = 1e-5
-#: number of steps after which, for fast convergence, modes must lie above this fraction of -sigma
-#: (where sigma is below zero)
-_EARLY, _FAR = 12, 0.1
-
-
-class BlockDavidson(BlockLanczos):
-    """The lowest modes by corrections with ``P`` near ``(K - sigma M)^-1`` [MorganScott1986]_."""
-
-    def __init__(
-        self,
-        solve: Callable[[FloatArray], FloatArray],
-        K: Matrix,
-        M: Matrix,
-        sigma: float,
-        locked: FloatArray,
-        *,
-        want: int,
-        rng: Rng = 0,
-        start: FloatArray | None = None,
-    ) -> None:
-        super().__init__(solve, M, locked, want=want, rng=rng, start=start)
-        self._K, self._sigma = by_rows(K), sigma
-        # as long as the errors of P do not matter, Lanczos steps converge as fast and cost less
-        for _ in range(_FIRST):
-            if self._loaded.shape[1]:
-                self._extend(self._loaded)
-
-    def modes(
-        self, count: int, extra: int, needed: Callable[[FloatArray], FloatArray]
-    ) -> FloatArray:
-        """Return the lowest shapes (n, count), the last `extra` of them for their values only."""
-        # only the values of the last `extra` are needed; `needed` gives the residual limits of
-        # shapes
-        found = np.zeros(count, dtype=bool)
-        self._limit, self._left = np.zeros(count), np.full(count, np.inf)
-        for _ in range(MOST_STEPS + count):
-            squares, mix = la.eigh(self._T)
-            if self.steps > _EARLY and squares[:count][-1] < -_FAR * self._sigma:
-                break
-            at = np.flatnonzero(~found[: self._m])[:COLUMNS]
-            residual, found[at] = self._residuals(squares, mix, at, needed)
-            # shapes of equal values have the same accuracy, since they may be mixed
-            last = squares[:count][-extra - 1] * (1 + SPREAD)
-            shapes = int(np.searchsorted(squares[:count], last, side="right"))
-            if np.all(found[:shapes]) and np.all(self._left <= _VALUE):
-                # check all again: a mode found late changes those above it
-                at = np.arange(count)
-                self._limit[:], self._left[:] = 0.0, np.inf
-                residual, found = self._residuals(squares, mix, at, needed)
-                if np.all(found[:shapes]) and np.all(self._left <= _VALUE):
-                    return self._shapes(mix[:, :count])
-            unfinished = residual[:, ~found[at]][:, :COLUMNS]
-            if not unfinished.shape[1]:
-                continue
-            if self._r + self._m + COLUMNS > self._capacity:
-                self._restart(squares, mix, max(count + self._block, 2 * self._m // 3))
-            self._extend(unfinished)
-        raise SolverError(
-            f"{counted(count, 'mode')} did not converge in {self.steps} steps of a Davidson "
-            "iteration: its preconditioner is too far from the inverse of K - sigma M."
-        )
-
-    def _extend(self, forces: FloatArray) -> None:
-        """Add ``P forces`` to the basis."""
-        moved = self._solve(forces)
-        block, self._loaded, _ = self._orthonormal(moved / np.linalg.norm(moved, axis=0))
-        width = block.shape[1]
-        if not width:
-            raise SolverError("the corrections of a Davidson iteration add no new direction.")
-        self._append(block)
-        along = along_basis(self._V[self._r : self._r + self._m], np.asarray(self._K @ block))
-        grown = np.zeros((self._m, self._m))
-        grown[:-width, :-width] = self._T
-        grown[:, -width:] = along
-        grown[-width:, :] = along.T
-        self._T = grown
-        self.steps += 1
-        tick(STEPS)
-
-    def _residuals(
-        self,
-        squares: FloatArray,
-        mix: FloatArray,
-        at: IntArray,
-        needed: Callable[[FloatArray], FloatArray],
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return ``K phi - omega^2 M phi`` of some shapes, and which of them are found."""
-        phi = self._shapes(mix[:, at])
-        force = np.asarray(self._K @ phi)
-        size = np.linalg.norm(force, axis=0)
-        force -= np.asarray(self._M @ phi) * squares[at]
-        left = np.linalg.norm(force, axis=0) / size
-        near = left < ROOT
-        new = np.flatnonzero(near & (self._limit[at] == 0))
-        if new.size:
-            self._limit[at[new]] = needed(phi[:, new])
-        self._left[at] = left
-        return force, near & (left <= self._limit[at])

@@ -20,7 +20,7 @@ from ..lti.statespace import StateSpace, System
 from ..modes import Modes
 from ..modes.dynamic_basis import DynamicBasis, checked_response
 from ..modes.solve import modes_reaching
-from ..modes.statics import held_factor
+from ..modes.sparse_modes import held_factor
 from ..parallel import Progress
 from ..reduction import ReducedModel
 from ..store import checked

@@ -31,8 +31,8 @@ from ..modes.dynamic_basis import (
 )
 from ..modes.matching import pair_modes
 from ..modes.modes import Modes
-from ..modes.solve import modes_reaching
-from ..modes.statics import held_factor, labels_of, places, static_response
+from ..modes.solve import labels_of, modes_reaching, places, static_response
+from ..modes.sparse_modes import held_factor
 from ..store import Value
 from ..structure import FEModel
 from ..tolerances import FOUR_DIGITS, SAME

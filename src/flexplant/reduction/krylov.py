@@ -15,7 +15,8 @@ from ..arrays import FloatArray, real_array, whole
 from ..errors import ModelError, SolverError
 from ..labels import Place
 from ..modes.modes import Modes
-from ..modes.statics import held_factor, labels_of, places, static_response
+from ..modes.solve import labels_of, places, static_response
+from ..modes.sparse_modes import held_factor
 from ..sparse.factor import DENSE_LIMIT, dynamic_lu
 from ..sparse.symmetric import dense
 from ..store import checked

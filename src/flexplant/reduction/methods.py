@@ -14,8 +14,7 @@ from ..arrays import ComplexArray, FloatArray, instance, name_list, positive, wh
 from ..errors import LabelError, ModelError, ShapeError, attempted, counted, some_names
 from ..labels import DofSet, Place
 from ..modes.modes import Modes, require_real
-from ..modes.solve import solve_modes
-from ..modes.statics import places
+from ..modes.solve import places, solve_modes
 from ..parallel import Progress
 from ..store import Value, checked
 from ..structure import Damping, FEModel

@@ -14,7 +14,7 @@ from ..lti.balancing import hankel_values
 from ..lti.blocks_of_states import block_diagonal
 from ..lti.statespace import StateSpace
 from ..modes.modes import Modes
-from ..modes.statics import labels_of, places
+from ..modes.solve import labels_of, places
 from ..store import Value, checked
 from ..structure.definite import refuse_unstable
 

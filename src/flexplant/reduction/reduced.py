@@ -23,8 +23,7 @@ from ..errors import ModelError, counted
 from ..labels import DofSet, Place
 from ..modes.matching import calibration_of
 from ..modes.modes import Modes, calibrated_matrices, measured_poles, require_real
-from ..modes.normal_forms import normal_form
-from ..modes.solve import leaving_overdamped
+from ..modes.normal_forms import normal_form, overdamped_notes
 from ..parallel import Progress
 from ..sparse.symmetric import orthonormalised, projected
 from ..store import Value, checked
@@ -383,8 +382,8 @@ class ReducedModel(Value):
         phi, dofs = form.phi, model.dofs
         if not self.is_physical:
             phi, dofs = model.expand(phi), model.full_dofs
-        found = Modes(form.omega, form.zeta, phi, dofs, n_rigid=form.n_rigid)
-        return leaving_overdamped(form, found)
+        notes = overdamped_notes(form, float(np.abs(form.poles).max(initial=0.0)))
+        return Modes(form.omega, form.zeta, phi, dofs, n_rigid=form.n_rigid, notes=notes)
 
     def quality(
         self,

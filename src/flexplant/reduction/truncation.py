@@ -13,8 +13,7 @@ from ..arrays import FloatArray, whole
 from ..errors import ModelError, counted
 from ..labels import Place
 from ..modes.modes import Modes, require_real
-from ..modes.solve import solve_modes
-from ..modes.statics import attachment_vectors, labels_of, places, static_response
+from ..modes.solve import attachment_vectors, labels_of, places, solve_modes, static_response
 from ..sparse.symmetric import projected
 from ..store import checked
 from ..structure import FEModel, ModalDamping
