@@ -43,7 +43,7 @@ LINES = [
     ("identification/spectra.py", "count / (1.0 + 2.0 * doubled)", "1.0 * count"),
     ("reduction/ranking.py", "np.sqrt(1 + 2 * a)", "np.sqrt(1 + a)"),
     ("estimation/steady_filter.py", "L_z @ m.R - 2.0 * N", "L_z @ m.R - N"),
-    ("structure/damping.py", "ratio = 0.5 * (self.alpha", "ratio = 1.0 * (self.alpha"),
+    ("structure/additions.py", "ratio = 0.5 * (self.alpha", "ratio = 1.0 * (self.alpha"),
     ("plant/realisation.py", "-0.5 * trace / np", "-1.0 * trace / np"),
     ("loop/measured_loop.py", "0.5 * at_zero",
      "1.0 * at_zero"),

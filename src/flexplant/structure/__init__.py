@@ -33,19 +33,19 @@ are not modelled.
 """
 
 from ..rooms import public_names as _public_names
-from .attachments import Damper as Damper
-from .attachments import HeldShape as HeldShape
-from .attachments import PointMass as PointMass
-from .attachments import Spring as Spring
-from .damping import Damping as Damping
-from .damping import ModalDamping as ModalDamping
-from .damping import Rayleigh as Rayleigh
+from .additions import Damper as Damper
+from .additions import Damping as Damping
+from .additions import ModalDamping as ModalDamping
+from .additions import PointMass as PointMass
+from .additions import Rayleigh as Rayleigh
+from .additions import Spring as Spring
 from .inspection import ModelCheck as ModelCheck
 from .inspection import check as check
 from .interpolation import ScatteredShape as ScatteredShape
 from .interpolation import interpolated as interpolated
 from .matrices import FEMatrices as FEMatrices
 from .model import FEModel as FEModel
+from .model import HeldShape as HeldShape
 from .plates import PlateShape as PlateShape
 from .plates import ThickPlateShape as ThickPlateShape
 from .plates import kirchhoff_plate as kirchhoff_plate

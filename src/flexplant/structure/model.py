@@ -11,14 +11,13 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from ..arrays import FloatArray, Matrix, instance, real_array
+from ..arrays import FloatArray, IntArray, Matrix, instance, real_array
 from ..errors import ModelError, counted, warn
-from ..labels import DofSet
+from ..labels import DofSet, Interpolation
 from ..sparse.factor import is_positive_definite
 from ..sparse.symmetric import matrix_sum, orthonormalised, with_pattern_of
 from ..store import Value, frozen
-from .attachments import HeldShape, Part, added_matrices
-from .damping import Damping, Rayleigh, damping_matrix
+from .additions import Damping, Part, Rayleigh, added_matrices, damping_matrix
 from .definite import (
     MatrixLike,
     check_semidefinite,
@@ -33,6 +32,46 @@ from .definite import (
 from .rigid import Placed, body_motions, force_parts, nearest_free, rigid_body_basis
 from .unit_systems import units
 from .zero_energy_motions import endangered, held_by_rounding
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class HeldShape(Interpolation):
+    """The interpolation of a structure after some of its DOFs were held by `FEModel.fixed`.
+
+    Parameters
+    ----------
+    free : Interpolation
+        Interpolation of the structure with all its DOFs.
+    rows_left : (n,) array of int
+        Positions of the remaining DOFs among all DOFs, counted from 0, in ascending order.
+
+    Examples
+    --------
+    The first node of a beam is clamped, so that four of six DOFs remain:
+
+    >>> import flexplant as fx
+    >>> bar = {"length": 0.2, "elements": 2, "area": 1e-4, "inertia": 1e-9}
+    >>> beam = fx.beam(**bar, density=7800.0, youngs_modulus=2.1e11)
+    >>> held = beam.fixed(["1:z", "1:ry"])
+    >>> held.dofs.interpolation
+    HeldShape(free=BeamShape(length=0.2, elements=2), rows_left=[2, 3, 4, 5])
+    """
+
+    free: Interpolation
+    rows_left: IntArray
+
+    def row(self, xyz: FloatArray, direction: str) -> FloatArray:
+        """Return the weights (n,) of the n DOFs in the motion `direction` at `xyz` [m]."""
+        return np.asarray(self.free.row(xyz, direction)[self.rows_left])
+
+    def rows(self, points: FloatArray, direction: str) -> FloatArray:
+        """Return the weights (p, n) at many points (p, 3) [m], with one row for each point."""
+        return np.asarray(self.free.rows(points, direction)[:, self.rows_left])
+
+    def dependent(self, label: str) -> tuple[FloatArray, FloatArray] | None:
+        """Return the row (n,) and the coordinates (3,) of a DOF that follows others, or None."""
+        found = self.free.dependent(label)
+        return None if found is None else (found[0][self.rows_left], found[1])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
