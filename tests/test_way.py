@@ -9,7 +9,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 #: files at most whose functions "A whole design" executes, bands of machines that a fit allows
 #: with the shapes measured included. The goal is 78: lower this with each file that leaves the way
-FILES = 79
+FILES = 78
 
 COUNT = """
 import importlib, pkgutil, re, sys

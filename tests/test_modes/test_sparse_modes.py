@@ -12,7 +12,7 @@ from flexplant.errors import ModelError
 from flexplant.modes import sparse_modes as counted
 from flexplant.modes.sparse_modes import counted_modes, modes_below, stiffness_factor
 from flexplant.sparse import ordering
-from flexplant.sparse.lowest import BlockLanczos
+from flexplant.sparse.symmetric import BlockLanczos
 from flexplant.structure import FEModel
 
 

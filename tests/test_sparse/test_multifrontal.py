@@ -13,10 +13,11 @@ from flexplant.sparse import ordering
 from flexplant.sparse.factor import (
     ComplexSymmetricFactor,
     MultifrontalFactor,
+    _error_radius,
     is_positive_definite,
     lowest_eigenvalue_bound,
+    multifrontal_inertia,
 )
-from flexplant.sparse.lowest import _error_radius, multifrontal_inertia
 from flexplant.sparse.ordering import dissect
 
 

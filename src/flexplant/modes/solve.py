@@ -16,9 +16,9 @@ from ..errors import ModelError, SolverError, counted, short
 from ..labels import DofSet, Place
 from ..parallel import Progress
 from ..sparse.factor import DENSE_LIMIT
-from ..sparse.lowest import STEPS
 from ..sparse.other_factors import Cholmod
 from ..sparse.symmetric import (
+    STEPS,
     Absolute,
     by_rows,
     column_groups,

@@ -14,21 +14,23 @@ from ..certificates import Certificate, Verified
 from ..errors import ModelError, SolverError, attempted, counted
 from ..parallel import expect, one_thread
 from ..sparse.davidson import BlockDavidson
-from ..sparse.factor import DENSE_LIMIT, LARGEST_FULL, MultifrontalFactor
-from ..sparse.lowest import (
-    BLOCK,
-    EXTRA,
-    BlockLanczos,
-    iterated,
+from ..sparse.factor import (
+    DENSE_LIMIT,
+    LARGEST_FULL,
+    MultifrontalFactor,
     multifrontal_inertia,
     signed_factor,
 )
 from ..sparse.ordering import Dissection, dissect
 from ..sparse.other_factors import Cholmod, CholmodCholesky
 from ..sparse.symmetric import (
+    BLOCK,
+    EXTRA,
     Absolute,
+    BlockLanczos,
     by_rows,
     column_groups,
+    iterated,
     rayleigh_ritz,
     rounding_of,
     same_pattern,

@@ -11,8 +11,7 @@ from ..arrays import COLUMNS, FloatArray, IntArray, Matrix, Rng
 from ..errors import SolverError, counted
 from ..parallel import tick
 from ..tolerances import MOST_STEPS, ROOT
-from .lowest import STEPS, BlockLanczos, along_basis
-from .symmetric import SPREAD, by_rows
+from .symmetric import SPREAD, STEPS, BlockLanczos, along_basis, by_rows
 
 #: number of steps that use M times the last block in place of residuals
 _FIRST = 10

@@ -12,8 +12,8 @@ from ..arrays import FloatArray, IntArray, divisor
 from ..errors import ModelError, SolverError
 from ..labels import DIRECTIONS
 from ..sparse.factor import is_positive_definite
-from ..sparse.lowest import EXTRA, MOST_ZEROS, Lowest, lowest_modes
-from ..sparse.symmetric import ZERO, by_rows, diagonal, orthonormalised, unit_diagonal
+from ..sparse.lowest import MOST_ZEROS, Lowest, lowest_modes
+from ..sparse.symmetric import EXTRA, ZERO, by_rows, diagonal, orthonormalised, unit_diagonal
 from ..tolerances import NEGLIGIBLE, PRECISION, RESIDUAL, SAME
 from .definite import are_rigid, are_swapped, unstable_stiffness
 from .matrices import FEMatrices

@@ -9,7 +9,9 @@ import scipy.sparse as sp
 
 from ..arrays import FloatArray
 from ..errors import ModelError, SolverError
-from ..sparse.lowest import EXTRA, lowest_modes, multifrontal_inertia
+from ..sparse.factor import multifrontal_inertia
+from ..sparse.lowest import lowest_modes
+from ..sparse.symmetric import EXTRA
 from ..tolerances import ROOT, TINY
 
 #: largest number of frequencies, since inverse iteration stores all shapes
