@@ -1,4 +1,4 @@
-"""Everything that flexplant raises or warns with, and the texts: names and sizes in words.
+"""Everything that flexplant raises or warns with, and texts of names, numbers and units.
 
 ::
 

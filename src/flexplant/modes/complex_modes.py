@@ -20,7 +20,8 @@ from .modes import Modes
 from .normal_forms import PROPORTIONAL, NormalForm, check_drag, normal_form, overdamped_notes
 from .sparse_modes import is_large, stiffness_factor
 
-#: residual of a mode, of what its inertia forces are and of rounding: as for undamped modes
+#: largest residual of a mode, relative to its inertia forces and to the sizes of all its forces, as
+#: for undamped modes
 _RESIDUAL = (ROOT, ROUNDING)
 #: additional undamped modes as a fraction and at least; and factor on the end of a band
 _MORE, _LEAST, _BEYOND = 4, 8, 1.3
