@@ -8,6 +8,7 @@ import noisy_plate
 from flexplant.errors import FlexplantWarning
 from flexplant.identification import average_frfs
 from flexplant.lti import Frf
+from flexplant.structure import chain
 from flexplant.updating import AddedDamping, AddedMass, FrfResidual, update
 from flexplant.updating.family import Family
 
@@ -46,6 +47,21 @@ def test_chance_and_deviation_with_few_runs(campaign, runs, alike, magnitude):
     assert np.sqrt(np.mean(np.square(scores))) == pytest.approx(1.0, abs=0.3)
     assert stats.kstest(chances, "uniform").pvalue > 1e-3
     assert min(chances) > 1e-4
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the updated model leaves more")  # four runs raise false alarms
+def test_errors_of_four_runs_are_as_large_as_their_deviations(campaign):
+    """With exact weights they would be 0.71 of what they are."""
+    rng = np.random.default_rng(4)
+    scores = []
+    for _ in range(100):
+        data = FrfResidual(averaged(campaign, rng, 4, 0.0))
+        parameters = [AddedMass(campaign.at), AddedDamping(campaign.at)]
+        fit = update(campaign.rom, parameters, [data], start=[0.4, 0.0], starts=1)
+        scores.append((fit.values - [0.5, 0.0]) / fit.std)
+    assert 0.75 < np.sqrt(np.mean(np.square(scores))) < 1.1
+    assert 0.93 < np.mean(np.abs(scores) < 1.96) < 0.99
 
 
 @pytest.mark.parametrize("magnitude", [False, True])
@@ -89,8 +105,26 @@ def test_a_model_that_is_wrong_widens_the_covariance_by_its_residual(campaign, r
             fit = update(campaign.rom, parameters, [data], **options)
         found.append(fit.std)
         plain.append(fit.chi2 / fit.dof)
+    # and by its uncertain weights, of which the plain variance does not know
+    found[1] *= np.sqrt((runs - 2) / (runs - 3))
     np.testing.assert_allclose(*found, rtol=0.02)
     np.testing.assert_allclose(*plain, rtol=0.02)
+
+
+@pytest.mark.parametrize("runs", [4, 8])
+def test_uncertain_weights_scatter_estimates(runs):
+    """The mean of n lines with weights 1/s^2, drawn: its variance over that of the plain mean."""
+    rng = np.random.default_rng(0)
+    n, draws = 400, 5000
+    weights = (runs - 1) / rng.gamma(runs - 1, size=(draws, n))
+    mean = np.sum(weights * rng.normal(size=(draws, n)), axis=1) / np.sum(weights, axis=1)
+    frf = Frf(FREQ, np.ones((1, 1, FREQ.size)), inputs=["1:x"], outputs=["1:x"])
+    frf = frf.replace(variance=np.full(frf.data.shape, 1e-2), freedom=runs - 1)
+    family = Family(chain(masses=[1.0, 1.0], stiffnesses=[1e4]), [])
+    assert FrfResidual(frf, direction="x").bound(family).scatter == pytest.approx(
+        n * np.var(mean), rel=0.06
+    )
+    assert FrfResidual(frf, variance=2e-2, direction="x").bound(family).scatter == 1.0
 
 
 def test_independent_outputs_count_whole_whoever_gives_the_variance(campaign):

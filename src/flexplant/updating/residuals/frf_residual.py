@@ -54,10 +54,11 @@ class FrfResidual(Residual):
     variance : float or array that spreads to (n_out, n_in, n_freq), optional
         Variance ``E|noise|^2`` of each entry. None: the variance of `measured`. If
         `measured.freedom` gives the number nu of degrees of freedom with which this variance was
-        estimated, the variance is multiplied by ``nu / (nu - 1)``. The correlation of neighbouring
-        lines follows from the window of the Frf, and that of outputs from its `correlation`. Both
-        count in the covariance and in chi-square. If no variance is known, each entry is divided by
-        the rms of its channel pair.
+        estimated, the variance is multiplied by ``nu / (nu - 1)``, and the covariance of the
+        parameters by ``(nu - 1) / (nu - 2)``, since the weights of the lines are uncertain. The
+        correlation of neighbouring lines follows from the window of the Frf, and that of outputs
+        from its `correlation`. Both count in the covariance and in chi-square. If no variance is
+        known, each entry is divided by the rms of its channel pair.
     lines : sequence of int or (n_freq,) bool array, optional
         Frequency lines to use. None: the lines at which the median of ``|H|^2 / variance`` over the
         channels is above 9. Without a variance, these are all lines. The line 0 Hz is not used.
@@ -199,7 +200,10 @@ class _BoundFrf(Bound):
             # |error|^2 over an estimated variance has Fisher's distribution: its variance, over
             # that of chi-square, for rows of all inputs, which share the noise of their output
             shared = len(frf.inputs) / (2.0 if self.magnitude else 1.0)
-            self.independent *= max(nu - 2.0, LEAST - 1.0) / (nu - 1.0 + shared)
+            left = max(nu - 2.0, LEAST - 1.0)
+            self.independent *= left / (nu - 1.0 + shared)
+            # with weights 1/s^2 of estimated variances s^2 it is mean(1/s^4) / mean(1/s^2)^2
+            self.scatter = max(nu - 1.0, 1.0) / left
         whole = 1 / sigma
         if not self.magnitude:
             whole = np.sqrt(np.mean(np.abs(self.data) ** 2, axis=0)) / sigma

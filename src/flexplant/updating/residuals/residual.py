@@ -94,6 +94,8 @@ class Bound(ABC):
     noise: Matrix | None = None
     #: share of the rows, whitened by `noise`, that count as independent in chi-square
     independent: float = 1.0
+    #: ratio of the variance of estimates to the variance if the weights were exact
+    scatter: float = 1.0
     #: directions of the rows in which residuals cannot lie: scale and phase of a shape
     lost: int = 0
     #: the measured value in units of each row

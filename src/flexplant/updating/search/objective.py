@@ -399,7 +399,7 @@ def covariance(objective: Objective, point: Point) -> tuple[FloatArray | None, F
     for bound, rows in objective.rows(point):
         part, data = U[rows].T @ U[rows], rows.stop
         if bound.has_noise:
-            known += U[rows].T @ bound.noise_times(U[rows])
+            known += bound.scatter * (U[rows].T @ bound.noise_times(U[rows]))
         else:
             other += part
             left += float(r[rows] @ r[rows])
