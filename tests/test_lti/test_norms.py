@@ -330,5 +330,6 @@ def test_no_interval_is_passed_in_which_the_gain_is_above_the_level():
         radius = peaks.NEAR * model.nearest(centre)
         inside = centre + radius * np.linspace(-1.0, 1.0, 401)
         most = np.abs(model.series(inside, 0)[0]).max()
-        assert not peaks._examined(model, centre, radius, 0.999 * most)[1].any()
-        assert peaks._examined(model, centre, radius, 1e3 * most)[1].all()
+        given = model, centre, radius, model.apart(centre)
+        assert not peaks._examined(*given, 0.999 * most)[1].any()
+        assert peaks._examined(*given, 1e3 * most)[1].all()

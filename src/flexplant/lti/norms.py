@@ -10,7 +10,7 @@ from ..arrays import FloatArray
 from ..errors import CertificateError, SolverError
 from ..parallel import Progress, one_thread
 from ..tolerances import MISSED, MOST_STEPS, RANK, SAME, SETTLED
-from .blocks_of_states import bilinear_matrices, is_block_diagonal
+from .blocks_of_states import bilinear_matrices, diagonal_blocks, is_block_diagonal
 from .equations import axis_frequencies, state_scale
 from .frequency_sweep import POINTS, resonance_grid, swept_gains
 from .lyapunov import (
@@ -174,11 +174,17 @@ def _proved(g: StateSpace, model: Residues | None) -> tuple[float, float] | None
 
 def _gain_at(g: StateSpace, freq: float) -> float:
     """Return the largest singular value at a frequency [Hz]."""
-    if g.blocks is not None:
-        return float(np.linalg.norm(responder(g)(np.array([freq]))[:, :, 0], 2))
-    s, d = points(g, np.array([freq]))[0], state_scale(g.A, g.B, g.C)
-    shifted = s * np.eye(d.size) - g.A * d / d[:, None]
-    return float(np.linalg.norm((g.C * d) @ np.linalg.solve(shifted, g.B / d[:, None]) + g.D, 2))
+    s = points(g, np.array([freq]))[0]
+    if is_block_diagonal(g):
+        pairs, slots = diagonal_blocks(g.A, g.blocks or ())
+        real = slots >= 0
+        moved = np.linalg.solve(s * np.eye(2) - pairs, g.B[slots] * real[:, :, None])
+        gain = (g.C[:, slots] * real).reshape(len(g.C), -1) @ moved.reshape(slots.size, -1)
+    else:
+        d = state_scale(g.A, g.B, g.C)
+        shifted = s * np.eye(d.size) - g.A * d / d[:, None]
+        gain = (g.C * d) @ np.linalg.solve(shifted, g.B / d[:, None])
+    return float(np.linalg.norm(gain + g.D, 2))
 
 
 #: relative tolerance of H2 norms from two routes: five digits. Squared norms from both Gramians may

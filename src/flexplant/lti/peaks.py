@@ -18,8 +18,9 @@ PEAKS, PART = 5, 0.7
 STEPS, SETTLED = 12, 1e-5
 #: radius of an interval, relative to the distance to the poles, below which its series is used
 NEAR = 0.6
-#: points from -1 to 1 at which an interval is divided otherwise: finer towards its ends
-CUTS = -np.cos(np.linspace(0.0, np.pi, 6))
+#: points from -1 to 1 at which an interval is divided otherwise: with poles at both of its ends
+#: the series holds on all parts but the outermost, since each is `NEAR` as wide as it is far
+CUTS = np.array([-1.0, -0.9, -0.6, 0.6, 0.9, 1.0])
 MIDDLES, HALVES = 0.5 * (CUTS[1:] + CUTS[:-1]), 0.5 * np.diff(CUTS)
 #: radii tried around a peak, in distances to the nearest pole
 ZONES = np.geomspace(0.4, 0.01, 6)
@@ -124,7 +125,8 @@ def _zone_radii(
     # of the others suffice
     t0, t1, t2 = (_frobenius(T)[:, None] for T in one.T)
     r = near[:, None] * ZONES  # (n_omega, n_zones)
-    beta = model.rest(np.repeat(omega, ZONES.size), r.reshape(-1), 2).reshape(r.shape)
+    apart = np.repeat(model.apart(omega), ZONES.size, axis=1)
+    beta = model.rest(apart, r.reshape(-1), 2).reshape(r.shape)
     whole = t0 + t1 * r + t2 * r**2
     cubic = 2 * t1 * t2 + t2**2 * r + 2 * beta * whole + beta**2 * r**3
     top, first = one.values[:, :1], one.together
@@ -155,20 +157,20 @@ def exceeding(model: Residues, level: float, peaks: Peaks) -> FloatArray | None:
     while centre.size:
         later, wide = centre[step:], radius[step:]
         centre, radius = centre[:step], radius[:step]
-        rough = through + model.rest(centre, radius, -1) > level
-        centre, radius = centre[rough], radius[rough]
-        fine = radius <= NEAR * model.nearest(centre)
+        apart = model.apart(centre)
+        rough = through + model.rest(apart, radius, -1) > level
+        centre, radius, apart = centre[rough], radius[rough], apart[:, rough]
+        fine = radius <= NEAR * apart.min(axis=0)
         left -= int(np.count_nonzero(fine))
         if left < 0:
             return None
-        higher, passed = _examined(model, centre[fine], radius[fine], level)
+        higher, passed = _examined(model, centre[fine], radius[fine], apart[:, fine], level)
         if higher.size:
             return higher
         stay = np.ones(centre.size, dtype=bool)
         stay[np.flatnonzero(fine)[passed]] = False
-        centre, radius = centre[stay, None], radius[stay, None]
-        centre = np.concatenate([(centre + radius * MIDDLES).reshape(-1), later])
-        radius = np.concatenate([(radius * HALVES).reshape(-1), wide])
+        centre, radius = _divided(centre[stay], radius[stay])
+        centre, radius = np.concatenate([centre, later]), np.concatenate([radius, wide])
     return np.zeros(0)
 
 
@@ -186,8 +188,14 @@ def _intervals_left(model: Residues, room: float, peaks: Peaks) -> tuple[FloatAr
     return centre[free], radius[free]
 
 
+def _divided(centre: FloatArray, radius: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return centres and radii of the parts of intervals."""
+    parts, widths = centre[:, None] + radius[:, None] * MIDDLES, radius[:, None] * HALVES
+    return parts.reshape(-1), widths.reshape(-1)
+
+
 def _examined(
-    model: Residues, centre: FloatArray, radius: FloatArray, level: float
+    model: Residues, centre: FloatArray, radius: FloatArray, apart: FloatArray, level: float
 ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
     """Return centres with gains above the level, and which intervals certainly stay below it."""
     # |G| <= max |T_0 +- r T_1| + r^2 |T_2| + O(r^3): the norm of a line is convex
@@ -195,13 +203,14 @@ def _examined(
         return centre, np.zeros(0, dtype=bool)
     T0, T1, T2 = model.series(centre, 2)
     r = radius[:, None, None]
-    rest = radius**2 * _frobenius(T2) + radius**3 * model.rest(centre, radius, 2)
+    rest = radius**2 * _frobenius(T2) + radius**3 * model.rest(apart, radius, 2)
     ends = np.stack([T0 + r * T1, T0 - r * T1])
     bound = _frobenius(ends).max(axis=0) + rest
     unsure = np.flatnonzero((bound > level) & (rest < level))
     bound[unsure] = _largest(ends[:, unsure]).max(axis=0) + rest[unsure]
     unsure = unsure[bound[unsure] > level]
-    return centre[unsure[_largest(T0[unsure]) > level]], bound <= level
+    above = unsure[_frobenius(T0[unsure]) > level]  # else it is below it
+    return centre[above[_largest(T0[above]) > level]], bound <= level
 
 
 def _frobenius(X: ComplexArray) -> FloatArray:
@@ -271,17 +280,17 @@ class Residues(NamedTuple):
         """Return the responses (p, m, n_freq) of a continuous system at frequencies [Hz]."""
         return np.moveaxis(self.series(2.0 * np.pi * freq, 0)[0], 0, 2)
 
-    def rest(self, omega: FloatArray, radius: FloatArray, order: int) -> FloatArray:
+    def rest(self, apart: FloatArray, radius: FloatArray, order: int) -> FloatArray:
         """Return a bound on ``|sum_(k > order) T_k d^k| / radius^(order + 1)`` for |d| <= radius.
 
-        Each pole at the distance a contributes a geometric series,
+        Each pole at the distance a (see `apart`) contributes a geometric series,
         ``1 / (a^(order+1) (a - radius))``; nearly infinite where a pole is closer than the radius.
         """
-        apart = self.apart(omega)
         free = np.maximum(apart - radius, np.cbrt(TINY))
         for _ in range(order + 1):
             free *= apart
-        return np.asarray(np.tile(self.sizes, 2) @ (1.0 / free))
+        own, conjugate = (1.0 / free).reshape(2, self.sizes.size, -1)
+        return np.asarray(self.sizes @ (own + conjugate))
 
     @property
     def transposed(self) -> Residues:
