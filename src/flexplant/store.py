@@ -199,8 +199,12 @@ def rebuild(cls: type[Kind], state: Mapping[str, Any]) -> Kind:
 
 def frozen(value: Any) -> Any:
     """Return a read-only copy of an array, sparse matrix or mapping; anything else as it is."""
-    if value is None or isinstance(value, str | float | int):
+    # plain kinds first: questions about abstract classes are slow, and values are made often
+    if value is None or isinstance(value, (str, float, int, MappingProxyType)):
         return value
+    if type(value) is tuple:
+        arrays = value and isinstance(value[0], np.ndarray)
+        return tuple(frozen(item) for item in value) if arrays else value
     if isinstance(value, np.ndarray):
         if not value.flags.writeable and value.base is None:
             return value
@@ -212,9 +216,7 @@ def frozen(value: Any) -> Any:
         value.sum_duplicates()
         for part in (value.data, value.indices, value.indptr):
             part.flags.writeable = False
-    elif type(value) is tuple and value and isinstance(value[0], np.ndarray):
-        value = tuple(frozen(item) for item in value)
-    elif isinstance(value, Mapping) and not isinstance(value, MappingProxyType | Value):
+    elif isinstance(value, Mapping) and not isinstance(value, Value):
         value = MappingProxyType({key: frozen(item) for key, item in value.items()})
     return value
 
