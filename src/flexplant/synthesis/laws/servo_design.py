@@ -243,7 +243,7 @@ def servo_bandwidth(
     """
     peak = between(peak, "peak", 1.0, float("inf"), "No loop keeps |S| below 1: try 2.")
     task = servo_task(plant, poi, axes, rolloff, integrator, notches, observer)
-    return replace(task, searching=True).largest(float(peak))
+    return replace(task, sought=float(peak)).largest()
 
 
 def _refuse(closed: ClosedLoop, at: str, observed: bool, advice: str) -> None:
@@ -291,8 +291,9 @@ class ServoTask:
     integrator: float | None
     notches: tuple[float, ...] | None
     observer: StateSpace | None
-    #: whether poles that no law moves are found once and left out: there are many loops
-    searching: bool = False
+    #: peak of |S| at u that a search asks for. It judges many loops: poles that no law moves are
+    #: found once and left out
+    sought: float | None = None
 
     @property
     def rate(self) -> float:
@@ -354,7 +355,7 @@ class ServoTask:
                 break
             axes = (self.axis(a.line, a.bandwidth, lead) for a in plain.axes)
             wide = self.notched(plain.of(axes))
-            if self._runs(wide) and self._best([best, wide]) is wide:
+            if self._best([best, wide]) is wide and self._runs(wide):
                 wide = self._settling(wide)
                 best = wide if self._suppresses(wide) or not self._suppresses(best) else best
         return best
@@ -366,8 +367,11 @@ class ServoTask:
 
     def _runs(self, law: ServoLaw) -> bool:
         """Return whether the loop is stable, with the truncated modes where they are known."""
-        if self.radius(law) >= 1.0 or self.plant.evaluation_plant is None:
-            return self.radius(law) < 1.0
+        stable = self.radius(law) < 1.0
+        # a search refuses a law with a higher peak in any case
+        refused = self.sought is not None and self.loop.peak(law)[0] > max(self.sought, TARGET)
+        if not stable or refused or self.plant.evaluation_plant is None:
+            return stable
         loop = self.closed(law)
         return (loop.completed or loop).is_stable
 
@@ -477,7 +481,7 @@ class ServoTask:
     @cached_property
     def path(self) -> tuple[StateSpace, float]:
         """From u to what the servo reads, and the largest size of a pole left out of it."""
-        if not self.searching:
+        if self.sought is None:
             return self.whole, 0.0
         kept, fixed = minimal(self.whole), self.whole.poles()
         for pole in kept.poles():
@@ -509,8 +513,9 @@ class ServoTask:
 
         return found
 
-    def largest(self, peak: float) -> float:
-        """Return the largest bandwidth that holds a peak of |S| at u."""
+    def largest(self) -> float:
+        """Return the largest bandwidth that holds the peak of |S| at u that is sought."""
+        peak = self.sought or TARGET
         best: tuple[float, float, float] = (np.inf, np.nan, np.nan)
 
         def fine(loop: ClosedLoop) -> bool:
