@@ -1,9 +1,5 @@
 """Similarity, modal blocks, the split into stable part and rest, minimal realisations."""
 
-from fractions import Fraction
-from functools import reduce
-from math import factorial
-
 import numpy as np
 import pytest
 import scipy.linalg as la
@@ -18,7 +14,6 @@ from flexplant.lti import (
     discretized,
     minimal,
     modal_form,
-    pade,
     parallel,
     series,
     split_stable,
@@ -259,68 +254,6 @@ def test_minimal_cancels_a_pole_and_a_zero():
     for bad in (0.0, 1.0, -1.0):
         with pytest.raises(ModelError, match="tol"):
             minimal(lag, tol=bad)
-
-
-def chain_of(parts, delay=1e-3, order=12):
-    """A system of stages in series, and the exact response of these stages at s.
-
-    A number a is a washout s / (s + a), "1/s" an integrator, "P" a Pade approximation, whose
-    coefficients are known as fractions.
-    """
-    c = [
-        Fraction(factorial(2 * order - k) * factorial(order), factorial(2 * order))
-        / (factorial(k) * factorial(order - k))
-        for k in range(order + 1)
-    ]
-    up, down = ([float(x) * (sign * delay) ** k for k, x in enumerate(c)] for sign in (-1, 1))
-
-    def stage(part):
-        if part == "P":
-            return pade(delay, order=order)
-        pole, C, D = (0.0, 1.0, 0.0) if part == "1/s" else (-part, -part, 1.0)
-        return StateSpace([[pole]], [[1.0]], [[C]], [[D]], inputs=["u"], outputs=["y"])
-
-    def gain(part, s):
-        if part == "P":
-            return np.polyval(up[::-1], s) / np.polyval(down[::-1], s)
-        return 1.0 / s if part == "1/s" else s / (s + part)
-
-    whole = reduce(series, (stage(part) for part in parts))
-    return whole.replace(blocks=None), lambda s: np.prod([gain(part, s) for part in parts], axis=0)
-
-
-@pytest.mark.parametrize("delay", [1e-3, 1.0])
-@pytest.mark.parametrize("a", [0.1, 10.0, 1e3])
-@pytest.mark.parametrize(
-    ("parts", "hidden"),
-    [
-        (("1/s", "a", "P"), 1),
-        (("P", "1/s", "a"), 1),
-        (("a", "P", "1/s"), 1),
-        (("P", "1/s", "1/s", "a"), 1),
-        (("1/s", "P", "a", "1/s", "2a"), 2),
-    ],
-    ids=str,
-)
-def test_minimal_cancels_integrators_of_a_pade_approximation(parts, hidden, a, delay):
-    """Modes of an approximation of order 12 are almost parallel: they spoilt all others."""
-    values = {"a": a, "2a": 2.0 * a}
-    g, exact = chain_of([values.get(part, part) for part in parts], delay)
-    found = minimal(g)
-    assert found.n_states == g.n_states - hidden
-    s = 2j * np.pi * np.geomspace(0.01, 1.0, 9) / delay
-    np.testing.assert_allclose([found(one) for one in s], exact(s), rtol=1e-5)
-
-
-def test_minimal_keeps_a_zero_near_two_integrators():
-    """A state is not hidden because it matters at low frequencies only."""
-    for zero in (1e-5, 1e-3):
-        C = [[zero, 1.0, 0.0, 0.0]]
-        g = StateSpace(
-            [[0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1], [0, 0, -1.0, -0.1]],
-            [[0.0], [0.0], [0.0], [1.0]], C, [[0.0]],
-        )  # fmt: skip
-        assert minimal(g) is g
 
 
 def masses(*pairs):

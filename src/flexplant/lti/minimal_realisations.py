@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,9 +21,6 @@ from .statespace import StateSpace, System, as_statespace
 #: distance of a point from the imaginary axis, relative to its frequency: large enough to avoid
 #: resonances and zeros
 FAR_OFF = 0.1
-#: least speed by which poles are moved until they are stable, relative to the slowest mode: even
-#: units make a chain of integrators arbitrarily slow where one of its states is hidden
-SLOW = 1e-4
 
 
 def minimal(sys: System, *, tol: float = 1e-10) -> StateSpace:
@@ -71,21 +67,13 @@ def minimal(sys: System, *, tol: float = 1e-10) -> StateSpace:
     tol = between(tol, "tol", 0.0, 1.0, "Try 1e-9.")
     if not g.n_states:
         return g
-    even, groups = (g, _block_groups(g)) if is_block_diagonal(g) else _dense_groups(g)
-    visible, slowest = _visible(groups, tol), _frequencies(groups)[0]
-    kept, hidden = [], []
-    for group in groups:
-        none = np.zeros((group.part.n_states, 0))
-        W, T = _essential(group.part, tol, slowest) if group in visible else (none, none)
-        if T.size:
-            kept.append(_Group(_projected(group.part, W, T), group.omega))
-        if group.bases is not None:
-            right, left = group.bases
-            hidden.append((right @ _complement(W), left @ _complement(T)))
+    groups = _pole_groups(g)
+    kept = [_Group(_less(group.part, tol), group.omega) for group in _visible(groups, tol)]
+    kept = [group for group in kept if group.part.n_states]
     n = sum(group.part.n_states for group in kept)
     if n == g.n_states:
         return g
-    parts, at = [group.part for group in kept], _frequencies(kept)
+    parts = [group.part for group in kept]
     found = g.replace(
         A=block_matrix([part.A for part in parts]),
         B=np.vstack([g.B[:0], *(part.B for part in parts)]),
@@ -93,54 +81,21 @@ def minimal(sys: System, *, tol: float = 1e-10) -> StateSpace:
         states=[f"x{i}" for i in range(1, n + 1)],
         blocks=(joined_blocks(parts) or None) if g.blocks is not None else None,
     )
-    if not _agree(found, g, at) and hidden:
-        # modes cancel each other where the response rolls off, and where they are almost parallel
-        with suppress(np.linalg.LinAlgError):
-            found = _without(even, hidden)
-    return found if _agree(found, g, at) else g
+    return found if _agree(found, g, _frequencies(kept)) else g
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class _Group:
     """Modes of equal poles as a separate system, without feedthrough, and where they act."""
 
     part: StateSpace
     omega: FloatArray  # [rad/s], 0 for a rigid-body mode or an integrator
-    #: bases (n, k) of its right and left invariant subspace in a dense system
-    bases: tuple[FloatArray, FloatArray] | None = None
 
 
-def _complement(basis: FloatArray) -> FloatArray:
-    """Return an orthonormal basis of the vectors that are orthogonal to a basis (n, k)."""
-    return np.asarray(np.linalg.qr(basis, mode="complete")[0][:, basis.shape[1] :])
-
-
-def _without(g: StateSpace, hidden: list[tuple[FloatArray, FloatArray]]) -> StateSpace:
-    """Return a system without invariant subspaces, given by bases (n, k) on the right and left."""
-    right = _unmixed_complement(np.hstack([left for _, left in hidden]))
-    left = _unmixed_complement(np.hstack([right for right, _ in hidden]))
-    rows = np.linalg.solve(left.T @ right, left.T)
-    A, B, C = rows @ g.A @ right, rows @ g.B, g.C @ right
-    return g.replace(A=A, B=B, C=C, states=[f"x{i}" for i in range(1, len(A) + 1)])
-
-
-def _unmixed_complement(basis: FloatArray) -> FloatArray:
-    """Return a basis of the vectors that are orthogonal to a basis (n, k).
-
-    Each vector contains one of n - k states and the k others. An orthonormal basis would mix small
-    states with the rounding of large ones.
-    """
-    n, k = basis.shape
-    order = la.qr(basis.T, mode="r", pivoting=True)[1]
-    others, states = order[:k], np.sort(order[k:])
-    found = np.zeros((n, n - k))
-    found[states, np.arange(n - k)] = 1.0
-    found[others] = -np.linalg.solve(basis[others].T, basis[states].T)
-    return found
-
-
-def _block_groups(g: StateSpace) -> list[_Group]:
+def _pole_groups(g: StateSpace) -> list[_Group]:
     """Return the system, but for its feedthrough, as a sum of groups of modes of equal poles."""
+    if not is_block_diagonal(g):
+        return _dense_groups(g)
     poles = g.poles()
     owner = np.repeat(np.arange(len(g.blocks or ())), g.blocks or ())
     label = _labels(poles, SPLIT * np.abs(poles), owner[:, None] == owner)
@@ -151,31 +106,22 @@ def _block_groups(g: StateSpace) -> list[_Group]:
     ]
 
 
-def _dense_groups(g: StateSpace) -> tuple[StateSpace, list[_Group]]:
-    """Return any system in even units, and its groups.
-
-    If its modes are too mixed, the groups are its stable part and the rest, without bases.
-    """
+def _dense_groups(g: StateSpace) -> list[_Group]:
+    """Return the groups of any A; its stable part and the rest where its modes are too mixed."""
     d = state_scale(g.A, g.B, g.C)
     A, B, C = g.A * d / d[:, None], g.B / d[:, None], g.C * d
     # the largest meaningful condition of a pole: of a double one, then of any multiplicity
     for largest in (1.0 / ROOT, 1.0 / ROUNDING):
-        poles, vectors, error, duals = eigenvalues_with_error(A, largest)
+        poles, vectors, error = eigenvalues_with_error(A, largest)
         same = SPLIT * np.abs(poles)
         conjugate = np.abs(poles[:, None] - poles.conj()) <= same
         label = _labels(poles, np.maximum(same, error), conjugate)
         bases = _bases(A, poles, vectors, error, label)
         V = np.hstack(bases)
         units = np.linalg.norm(V, axis=1)  # units in which the signals of a cascade have equal size
-        # left vectors depend on their own group alone. The inverse of V spoils all groups if some
-        # modes are almost parallel, such as those of a Pade approximation
-        rows = _bases(A.T, poles, duals.conj(), error, label)
-        pairs = [
-            _biorthogonal(right / units[:, None], left * units[:, None])
-            for right, left in zip(bases, rows, strict=True)
-        ]
-        sizes = [float(np.linalg.norm(right) * np.linalg.norm(left)) for right, left in pairs]
-        apart = all(size <= 1.0 / SPLIT for size in sizes)
+        V = V / units[:, None]
+        whole = V.shape == A.shape and bool(np.all(np.isfinite(V)))
+        apart = whole and float(np.linalg.cond(V)) <= 1.0 / SPLIT
         if apart:
             break
     centre = 1.0 if g.dt else 0.0
@@ -183,30 +129,17 @@ def _dense_groups(g: StateSpace) -> tuple[StateSpace, list[_Group]]:
     if not apart:
         split = split_stable(g)
         parts = [split.stable.replace(D=0 * g.D), split.rest]
-        return g, [_Group(part, omega) for part in parts if part.n_states]
-    even = g.replace(
-        A=A * units / units[:, None], B=B / units[:, None], C=C * units, states=(), blocks=None
-    )
-    groups = []
-    for k, (right, left) in enumerate(pairs):
-        A, B, C = left.T @ even.A @ right, _sum_of(left.T, even.B), _sum_of(even.C, right)
-        part = even.replace(A=A, B=B, C=C, D=0 * g.D, states=())
-        groups.append(_Group(part, omega[label == k], (right, left)))
-    return even, groups
-
-
-def _biorthogonal(right: FloatArray, left: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return bases with ``left.T @ right = 1``; the left one is infinite if there is none."""
-    try:
-        return right, np.asarray(np.linalg.solve(left.T @ right, left.T).T)
-    except np.linalg.LinAlgError:
-        return right, np.full_like(left, np.inf)
-
-
-def _sum_of(left: FloatArray, right: FloatArray) -> FloatArray:
-    """Return ``left @ right``, zero where it is the rounding of its terms."""
-    product = left @ right
-    return np.where(np.abs(product) > RANK * (np.abs(left) @ np.abs(right)), product, 0.0)
+        return [_Group(part, omega) for part in parts if part.n_states]
+    V_inverse = np.linalg.inv(V)
+    A, B = V_inverse @ (A * units / units[:, None]) @ V, V_inverse @ (B / units[:, None])
+    C = (C * units) @ V
+    groups, start = [], 0
+    for k, basis in enumerate(bases):
+        at = slice(start, start + basis.shape[1])
+        start = at.stop
+        part = g.replace(A=A[at, at], B=B[at], C=C[:, at], D=0 * g.D, states=(), blocks=None)
+        groups.append(_Group(part, omega[label == k]))
+    return groups
 
 
 def _labels(poles: ComplexArray, radius: FloatArray, together: Any) -> Any:
@@ -296,15 +229,12 @@ def _agree(found: StateSpace, g: StateSpace, omega: FloatArray) -> bool:
     return bool(np.max(np.abs(ours - wanted) * unit, initial=0.0) <= TYPED)
 
 
-def _essential(g: StateSpace, tol: float, slowest: float) -> tuple[FloatArray, FloatArray]:
-    """Return bases W, T (n, r) of the balanced states of Hankel singular values above `tol`.
-
-    ``W.T @ T = 1``. `slowest` is the frequency [rad/s] of the slowest mode of the whole system.
-    """
+def _less(g: StateSpace, tol: float) -> StateSpace:
+    """Return a system without the balanced states of Hankel singular values below `tol`."""
     n = g.n_states
     if n == 1 or (n == 2 and np.any(np.linalg.eigvals(g.A).imag)):
-        return np.eye(n), np.eye(n)  # a single mode is kept or removed
-    judged = _stabilised(g, SLOW * slowest)
+        return g  # a single mode is kept or removed
+    judged = _stabilised(g)
     # equal size of all channels: effect of each input on the states, and of the states on each
     # output
     seen = observability_factor(judged)
@@ -319,24 +249,15 @@ def _essential(g: StateSpace, tol: float, slowest: float) -> tuple[FloatArray, F
     rounding = RANK * float(np.linalg.norm(seen * d) * np.linalg.norm(reached / d))
     r = int(np.sum(values > max(tol * values[0], rounding)))
     if r == n:
-        return np.eye(n), np.eye(n)
-    root = np.sqrt(values[:r])
-    return seen @ left[:, :r] / root, reached @ right[:r].T / root
-
-
-def _projected(g: StateSpace, W: FloatArray, T: FloatArray) -> StateSpace:
-    """Return a group with the states ``W.T x``; in blocks if it had blocks."""
-    if T.shape[1] == g.n_states:
         return g
+    root = np.sqrt(values[:r])
+    W, T = seen @ left[:, :r] / root, reached @ right[:r].T / root
     less = g.replace(A=W.T @ g.A @ T, B=W.T @ g.B, C=g.C @ T, states=(), blocks=None)
-    return less if g.blocks is None else modal_form(less).system
+    return modal_form(less).system if g.blocks is not None and r else less
 
 
-def _stabilised(g: StateSpace, least: float) -> StateSpace:
-    """Return the system with its poles moved together until it is stable: the same subspaces.
-
-    If they are moved, then by at least a speed [rad/s].
-    """
+def _stabilised(g: StateSpace) -> StateSpace:
+    """Return the system with its poles moved together until it is stable: the same subspaces."""
     # by the speed of the system: with a much larger shift all poles look equal, and zeros near
     # chains of integrators are lost
     poles = g.poles()
@@ -346,12 +267,12 @@ def _stabilised(g: StateSpace, least: float) -> StateSpace:
         if radius < 1 and g.is_stable:
             return g
         # at most to a decay within five samples
-        speed = min(max(_matrix_size(g, g.A - radius * eye), least * g.dt), 0.2)
-        return g.replace(A=g.A / (radius + speed))
+        speed = min(_matrix_size(g, g.A - radius * eye), 0.2)
+        return g.replace(A=g.A / (radius + (speed or 0.2)))
     growth = float(poles.real.max())
     if growth < 0:
         return g
-    return g.replace(A=g.A - (growth + max(_matrix_size(g, g.A), least)) * eye)
+    return g.replace(A=g.A - (growth + (_matrix_size(g, g.A) or 1.0)) * eye)
 
 
 def _matrix_size(g: StateSpace, A: FloatArray) -> float:

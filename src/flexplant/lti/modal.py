@@ -133,7 +133,7 @@ def _basis(A: FloatArray, centre: float) -> tuple[FloatArray, FloatArray, list[i
     eye = np.eye(A.shape[0])
     # a slow mode is not a rigid-body mode, even if other modes are fast: rounding decides which may
     # be
-    values, vectors, error, _ = eigenvalues_with_error(A)
+    values, vectors, error = eigenvalues_with_error(A)
     near = np.abs(values - centre) <= error
     columns, parts = [np.zeros((A.shape[0], 0))], []
     chain = _chains(A - centre * eye, int(near.sum())) if near.sum() > 1 else None
@@ -405,14 +405,14 @@ def uncertain_poles(
     error = np.finfo(float).eps * size * np.ones(poles.size)
     if not np.any(gap <= SPLIT * size):
         return poles, error
-    poles, _, error, _ = eigenvalues_with_error(A)
+    poles, _, error = eigenvalues_with_error(A)
     return poles, error
 
 
 def eigenvalues_with_error(
     A: FloatArray, largest: float = 1.0 / ROOT
-) -> tuple[ComplexArray, ComplexArray, FloatArray, ComplexArray]:
-    """Return eigenvalues, eigenvectors, rounding errors of the eigenvalues, and left vectors."""
+) -> tuple[ComplexArray, ComplexArray, FloatArray]:
+    """Return eigenvalues, eigenvectors and the uncertainty of each eigenvalue by rounding."""
     # in the units of LAPACK's balancing, in which blocks of different speed do not affect each
     # other
     found: Any = la.eig(A, left=True, right=True)
@@ -425,5 +425,4 @@ def eigenvalues_with_error(
         np.asarray(values, dtype=np.complex128),
         right.astype(np.complex128),
         rounding * condition,
-        left.astype(np.complex128),
     )

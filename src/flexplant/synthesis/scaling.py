@@ -64,7 +64,7 @@ def loop_speed(g: StateSpace, m1: int, p1: int, dt: float = 0.0) -> float:
     # a loop gains nothing where u costs as much as it does to z, or where y shows as much noise as
     # w: the answers from u to z, and from w to y, have fallen to their feedthrough there. The
     # slowest of all channels counts; the mean pole where no channel has such a frequency
-    poles, _, error, _ = eigenvalues_with_error(g.A)
+    poles, _, error = eigenvalues_with_error(g.A)
     sizes = np.abs(poles)[np.abs(poles) > error]
     if not sizes.size:
         return 1.0

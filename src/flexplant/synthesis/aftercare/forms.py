@@ -263,7 +263,7 @@ def _difference(K: StateSpace, away: Callable[[FloatArray], ComplexArray], most:
     """
     if not K.n_states:
         return 0.0
-    poles, _, moved, _ = eigenvalues_with_error(K.A)
+    poles, _, moved = eigenvalues_with_error(K.A)
     grid = resonance_grid(poles, K.dt, points=60)
     # nearer to poles than this the response is one of rounding: of a double pole at z = 1 in a
     # full A, say, which comes out as two, 1e-8 apart. The square of the relative error, for a
