@@ -44,7 +44,7 @@ DEVIATIONS = 2.0
 CERTAIN = 6.0
 #: largest number of steps of an iteration that converges: 60 bisections or doublings reach rounding
 MOST_STEPS = 60
-#: number of plants of which is kept, for all of their loops, what no controller changes
+#: number of plants whose results that no controller changes are kept, for all of their loops
 KEPT_PLANTS = 8
 #: numbers that were typed, or printed into a file by another program, have at least six digits; no
 #: model of a machine is better known, so that two ways to one figure agree to this

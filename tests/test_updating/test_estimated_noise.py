@@ -121,9 +121,10 @@ def test_uncertain_weights_scatter_estimates(runs):
     frf = Frf(FREQ, np.ones((1, 1, FREQ.size)), inputs=["1:x"], outputs=["1:x"])
     frf = frf.replace(variance=np.full(frf.data.shape, 1e-2), freedom=runs - 1)
     family = Family(chain(masses=[1.0, 1.0], stiffnesses=[1e4]), [])
-    assert FrfResidual(frf, direction="x").bound(family).scatter == pytest.approx(
-        n * np.var(mean), rel=0.06
-    )
+    scatter = FrfResidual(frf, direction="x").bound(family).scatter
+    assert scatter == pytest.approx(n * np.var(mean), rel=0.06)
+    fewer = FrfResidual(frf.replace(freedom=runs - 2), direction="x").bound(family)
+    assert fewer.scatter > scatter
     assert FrfResidual(frf, variance=2e-2, direction="x").bound(family).scatter == 1.0
 
 

@@ -18,8 +18,8 @@ PEAKS, PART = 5, 0.7
 STEPS, SETTLED = 12, 1e-5
 #: radius of an interval, relative to the distance to the poles, below which its series is used
 NEAR = 0.6
-#: points from -1 to 1 at which an interval is divided otherwise: with poles at both of its ends
-#: the series holds on all parts but the outermost, since each is `NEAR` as wide as it is far
+#: points from -1 to 1 at which an interval is divided otherwise. The radius of each part but the
+#: outermost is at most `NEAR` times its distance to the nearest end, where a pole may lie
 CUTS = np.array([-1.0, -0.9, -0.6, 0.6, 0.9, 1.0])
 MIDDLES, HALVES = 0.5 * (CUTS[1:] + CUTS[:-1]), 0.5 * np.diff(CUTS)
 #: radii tried around a peak, in distances to the nearest pole

@@ -20,9 +20,8 @@ from .modes import Modes
 from .normal_forms import PROPORTIONAL, NormalForm, check_drag, normal_form, overdamped_notes
 from .sparse_modes import is_large, stiffness_factor
 
-#: largest residual of a mode, relative to its inertia forces and to the sizes of all its forces, as
-#: for undamped modes
-_RESIDUAL = (ROOT, ROUNDING)
+#: largest residual of a mode, relative to its inertia forces and to the sizes of all its forces
+RESIDUAL = (ROOT, ROUNDING)
 #: additional undamped modes as a fraction and at least; and factor on the end of a band
 _MORE, _LEAST, _BEYOND = 4, 8, 1.3
 
@@ -105,7 +104,7 @@ def damped_modes(
                 shapes,
                 model.dofs,
                 n_rigid=r,
-                residual=_RESIDUAL[0] * part[: keep.size],
+                residual=RESIDUAL[0] * part[: keep.size],
                 certificate=Certificate((Verified("basis", float(V.shape[1])),)),
                 notes=overdamped_notes(form, _range(poles, top)),
             )
@@ -114,9 +113,9 @@ def damped_modes(
         if not more.shape[1]:
             break
         V = np.hstack([V, more])
-    worst = float((size[wrong] / limit[wrong]).max()) * _RESIDUAL[0]
+    worst = float((size[wrong] / limit[wrong]).max()) * RESIDUAL[0]
     raise SolverError(
-        f"complex modes leave a relative residual of {worst:.2g} (limit {_RESIDUAL[0]:g}) after "
+        f"complex modes leave a relative residual of {worst:.2g} (limit {RESIDUAL[0]:g}) after "
         f"{counted(V.shape[1], 'vector')}: the damping is strong. Want fewer modes, or reduce the "
         "model by CraigBampton at the dampers, which keeps D, and take its modes()."
     )
@@ -159,9 +158,9 @@ def _rest(
     moved = np.abs(x)
     moved = moved + NEGLIGIBLE * moved.max(axis=0)
     whole = Absolute(K) @ moved + np.abs(poles) * (Absolute(D) @ moved)
-    limit = _RESIDUAL[0] * np.linalg.norm(weight * inertia, axis=0)
+    limit = RESIDUAL[0] * np.linalg.norm(weight * inertia, axis=0)
     # real poles are not returned: their approximate place suffices
-    part = np.where(poles.imag == 0, _RESIDUAL[0], _RESIDUAL[1])
+    part = np.where(poles.imag == 0, RESIDUAL[0], RESIDUAL[1])
     limit = limit + part * np.linalg.norm(weight * whole, axis=0)
     size[:n_rigid] = 0.0  # zero by convention; rigid-body modes are checked as undamped modes
     return np.asarray(rest), np.asarray(size), np.asarray(limit)

@@ -18,7 +18,7 @@ from ..parallel import Progress
 from ..sparse.factor import DENSE_LIMIT
 from ..sparse.other_factors import Cholmod
 from ..sparse.symmetric import (
-    STEPS,
+    LANCZOS_STEPS,
     Absolute,
     by_rows,
     column_groups,
@@ -29,8 +29,8 @@ from ..sparse.symmetric import (
 )
 from ..structure import Damping, FEModel, ModalDamping
 from ..structure.definite import elastic_modes, signed, signed_root, signed_square
-from ..tolerances import NEGLIGIBLE, PRECISION, ROOT, ROUNDING, SAME
-from .complex_modes import coupled_modes, is_proportional, is_rayleigh, wider
+from ..tolerances import NEGLIGIBLE, PRECISION, ROUNDING, SAME
+from .complex_modes import RESIDUAL, coupled_modes, is_proportional, is_rayleigh, wider
 from .modes import Modes
 from .sparse_modes import counted_modes, is_large, modes_below, stiffness_factor
 
@@ -146,7 +146,9 @@ def solve_modes(
     # complex modes of a large model are found in a basis of more undamped ones
     perhaps = damping is None and model.D is not None and is_large(model)
     more = wider(kept, top, model.n_dof) if perhaps and not is_rayleigh(model) else (kept, top)
-    with Progress(None, STEPS, progress=progress, advice="Fewer modes (count=, below=) take less."):
+    with Progress(
+        None, LANCZOS_STEPS, progress=progress, advice="Fewer modes (count=, below=) take less."
+    ):
         # one factor for the modes and for the attachment vectors, while it is held here
         factored = stiffness_factor(model, factor) if at and is_large(model) else None
         omega, phi, certificate = _undamped(model, *more, factor)
@@ -287,8 +289,6 @@ def _undamped(
 
 #: largest error of M-orthonormality of a result
 _ORTHONORMAL = ROUNDING
-#: residual ||K phi - omega^2 M phi||, of omega^2 ||M phi|| and of || |K| |phi| ||
-_RESIDUAL = (ROOT, ROUNDING)
 
 
 def check_modes(
@@ -343,8 +343,8 @@ def _mode_residuals(model: FEModel, omega: FloatArray, phi: FloatArray) -> tuple
         # an entry of a shape has the rounding error of the largest entries, which stiff springs
         # multiply
         whole += rows * (NEGLIGIBLE * moved.max(axis=0))
-        limit[at] = _RESIDUAL[0] * _lengths(mass, weight) * omega[at] ** 2
-        limit[at] += _RESIDUAL[1] * _lengths(whole, weight)
+        limit[at] = RESIDUAL[0] * _lengths(mass, weight) * omega[at] ** 2
+        limit[at] += RESIDUAL[1] * _lengths(whole, weight)
         scale = np.where(elastic[at], _lengths(force), np.inf)
         mass *= signed_square(omega[at])
         force -= mass

@@ -24,8 +24,8 @@ from ..sparse.factor import (
 from ..sparse.ordering import Dissection, dissect
 from ..sparse.other_factors import Cholmod, CholmodCholesky
 from ..sparse.symmetric import (
-    BLOCK,
-    EXTRA,
+    EXTRA_VALUES,
+    LANCZOS_VECTORS,
     Absolute,
     BlockLanczos,
     by_rows,
@@ -269,7 +269,7 @@ def counted_modes(
     expect(2 * order.multiplications + count * (_EACH_DOF * n + _EACH_ENTRY * order.n_factor))
     squares, phi = np.zeros(0), np.zeros((n, 0))
     counted, sure, shift = 0, 0, 0.0
-    missing = min(count + EXTRA, n - r)
+    missing = min(count + EXTRA_VALUES, n - r)
     for search in range(MOST_STEPS):
         factor = factor or new(model, method)
         locked = np.hstack([model.rigid_body, phi])
@@ -308,7 +308,7 @@ def counted_modes(
             return squares[:count], phi[:, :count], _certificate(shift, counted + r, sure + r)
         if counted < sure:
             break
-        missing = min(counted - sure + EXTRA, n - r - squares.size)
+        missing = min(counted - sure + EXTRA_VALUES, n - r - squares.size)
     raise SolverError(
         (
             f"below {np.sqrt(shift) / (2 * np.pi):.6g} Hz a Sturm count finds {counted + r} modes, "
@@ -349,7 +349,7 @@ def _search(
 ) -> tuple[FloatArray, FloatArray]:
     """Return omega^2 and shapes (n, want) next to the locked ones, residuals down to rounding."""
     # soft modes first: they are locked, and a new search finds those that their rounding hides
-    held, block = model.body_motions, BLOCK
+    held, block = model.body_motions, LANCZOS_VECTORS
     start = None if locked.shape[1] >= held.shape[1] else held
     squares, found = _search_once(model, factor, locked, want, rng, start)
     while 0 < found.shape[1] < want:
@@ -370,10 +370,10 @@ def _search_once(
     want: int,
     rng: Rng,
     start: FloatArray | None,
-    block: int = BLOCK,
+    block: int = LANCZOS_VECTORS,
 ) -> tuple[FloatArray, FloatArray]:
     """Return omega^2 and shapes, up to `want`, of one search."""
-    extra = min(EXTRA, want - 1)
+    extra = min(EXTRA_VALUES, want - 1)
     mass, stiffness = by_rows(model.M), by_rows(model.K)
     if factor.single:
         davidson = BlockDavidson(
@@ -412,7 +412,7 @@ def _excess(
 ) -> float:
     """Return the largest residual of the first shapes, relative to its limit or `least`."""
     left, least, size_of_K = 0.0, np.broadcast_to(least, squares.shape), Absolute(K)
-    for at in column_groups(squares.size, BLOCK):
+    for at in column_groups(squares.size, LANCZOS_VECTORS):
         force, limit = _let_pass(K, size_of_K, phi[:, at])
         limit = np.maximum(limit, least[at]) * np.linalg.norm(force, axis=0)
         force -= (M @ phi[:, at]) * squares[at]
@@ -423,7 +423,7 @@ def _excess(
 def _tolerance(K: Any, part: float, phi: FloatArray) -> FloatArray:
     """Return the relative error of each shape at which its residual is `part` of the limit."""
     size_of_K, limit = Absolute(K), np.zeros(phi.shape[1])
-    for at in column_groups(limit.size, BLOCK):
+    for at in column_groups(limit.size, LANCZOS_VECTORS):
         limit[at] = part * _let_pass(K, size_of_K, phi[:, at])[1]
     return limit
 

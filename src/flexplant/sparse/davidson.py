@@ -1,4 +1,4 @@
-"""The lowest modes by Davidson's method, from an inverse that is only near."""
+"""The lowest modes by Davidson's method, with an approximate inverse."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ..arrays import COLUMNS, FloatArray, IntArray, Matrix, Rng
 from ..errors import SolverError, counted
 from ..parallel import tick
 from ..tolerances import MOST_STEPS, ROOT
-from .symmetric import SPREAD, STEPS, BlockLanczos, along_basis, by_rows
+from .symmetric import LANCZOS_STEPS, SPREAD, BlockLanczos, along_basis, by_rows
 
 #: number of steps that use M times the last block in place of residuals
 _FIRST = 10
@@ -94,7 +94,7 @@ class BlockDavidson(BlockLanczos):
         grown[-width:, :] = along.T
         self._T = grown
         self.steps += 1
-        tick(STEPS)
+        tick(LANCZOS_STEPS)
 
     def _residuals(
         self,

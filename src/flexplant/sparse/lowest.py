@@ -22,7 +22,16 @@ from .factor import (
     symmetric_lu,
 )
 from .ordering import Dissection, dissect
-from .symmetric import VALUE, ZERO, BlockLanczos, beyond, dense, diagonal, iterated, rayleigh_ritz
+from .symmetric import (
+    VALUE_SETTLED,
+    ZERO,
+    BlockLanczos,
+    beyond,
+    dense,
+    diagonal,
+    iterated,
+    rayleigh_ritz,
+)
 
 #: number of DOFs up to which dense LAPACK finds every eigenvalue
 _DENSE = 300
@@ -145,7 +154,7 @@ def _inverse_iteration(
     while shapes.shape[1] < count:
         # values hidden by the rounding of the largest one are found with it locked
         locked, want = np.hstack([known, shapes]), count - shapes.shape[1]
-        more = BlockLanczos(factor.solve, M, locked, want=want).lowest(want, VALUE)[1]
+        more = BlockLanczos(factor.solve, M, locked, want=want).lowest(want, VALUE_SETTLED)[1]
         if not more.shape[1]:
             break
         iterated(factor.solve, M, locked, more)

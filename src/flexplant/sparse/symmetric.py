@@ -314,14 +314,14 @@ def _mass_norm(M: Matrix, vector: FloatArray) -> float:
 
 
 #: number of vectors solved together
-BLOCK = 12
+LANCZOS_VECTORS = 12
 #: number of values above the last wanted one among which a gap for a count is searched
-EXTRA = 4
+EXTRA_VALUES = 4
 #: residual below which the value is exact to rounding, since its error is the square of the
 #: residual
-VALUE = SPLIT
+VALUE_SETTLED = SPLIT
 #: label of the progress bar
-STEPS = "modes, steps of Lanczos"
+LANCZOS_STEPS = "modes, steps of Lanczos"
 #: number of steps between two restarts with a large block
 _STEPS, _FEW_STEPS = 12, 6
 #: relative error of a Ritz pair below which its shape needs no separate tolerance
@@ -343,7 +343,7 @@ class BlockLanczos:
         *,
         want: int,
         rng: Rng = 0,
-        block: int = BLOCK,
+        block: int = LANCZOS_VECTORS,
         start: FloatArray | None = None,
     ) -> None:
         self._solve = solve
@@ -368,7 +368,7 @@ class BlockLanczos:
         # a restart keeps want + block vectors; then at least the same number again or _STEPS blocks
         # follow, fewer for a large block
         room = 2 * self._block + max(
-            _STEPS * BLOCK, _FEW_STEPS * self._block, 5 * want // 4 + self._block
+            _STEPS * LANCZOS_VECTORS, _FEW_STEPS * self._block, 5 * want // 4 + self._block
         )
         self._capacity = self._r + want + self._block + room
 
@@ -406,7 +406,7 @@ class BlockLanczos:
             last = theta[min(count, theta.size) - extra - 1] if theta.size > extra else 0.0
             shapes = int(np.count_nonzero(theta[:count] >= (1 - ROOT) * last))
             required = np.full(count, tolerance)
-            required[shapes:] = max(tolerance, VALUE)
+            required[shapes:] = max(tolerance, VALUE_SETTLED)
             strict = np.minimum(required, tolerance) if limited else required
             left = _unconverged(theta[:wanted], error, strict).size
             if theta.size >= wanted and not left and needed is not None:
@@ -459,7 +459,7 @@ class BlockLanczos:
         grown_T[-width:, -width:] = 0.5 * (along[-width:] + along[-width:].T)
         self._T = grown_T
         self.steps += 1
-        tick(STEPS)
+        tick(LANCZOS_STEPS)
 
     def _append(self, block: FloatArray) -> None:
         """Add a block to the basis."""

@@ -13,7 +13,7 @@ from ..errors import ModelError, SolverError
 from ..labels import DIRECTIONS
 from ..sparse.factor import is_positive_definite
 from ..sparse.lowest import MOST_ZEROS, Lowest, lowest_modes
-from ..sparse.symmetric import EXTRA, ZERO, by_rows, diagonal, orthonormalised, unit_diagonal
+from ..sparse.symmetric import EXTRA_VALUES, ZERO, by_rows, diagonal, orthonormalised, unit_diagonal
 from ..tolerances import NEGLIGIBLE, PRECISION, RESIDUAL, SAME
 from .definite import are_rigid, are_swapped, unstable_stiffness
 from .matrices import FEMatrices
@@ -281,7 +281,7 @@ def _try_lowest_modes(
         found = lowest_modes(
             kept_K,
             kept_M,
-            min(rigid + EXTRA, there.size),
+            min(rigid + EXTRA_VALUES, there.size),
             known=known,
             rounding=rounding,
             nodes=None if given.dofs is None else given.dofs.nodes[there],

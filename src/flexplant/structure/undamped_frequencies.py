@@ -11,7 +11,7 @@ from ..arrays import FloatArray
 from ..errors import ModelError, SolverError
 from ..sparse.factor import multifrontal_inertia
 from ..sparse.lowest import lowest_modes
-from ..sparse.symmetric import EXTRA
+from ..sparse.symmetric import EXTRA_VALUES
 from ..tolerances import ROOT, TINY
 
 #: largest number of frequencies, since inverse iteration stores all shapes
@@ -21,7 +21,7 @@ MOST = 60
 def natural_frequencies(K: Any, M: Any, count: int, *, rounding: float) -> FloatArray:
     """Return the lowest frequencies [Hz], zero for motions without energy."""
     n = K.shape[0]
-    found = lowest_modes(K, M, min(count + EXTRA, n), rounding=rounding)
+    found = lowest_modes(K, M, min(count + EXTRA_VALUES, n), rounding=rounding)
     values, shapes = found.values, found.shapes
     order = np.argsort(np.where(np.arange(values.size) < found.n_zero, -np.inf, values))
     values, shapes = values[order], shapes[:, order]

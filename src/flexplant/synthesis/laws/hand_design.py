@@ -1,4 +1,4 @@
-"""LoopDesign: loops shaped by hand, given blocks included, and the script that makes them again."""
+"""LoopDesign: loops shaped by hand, with elements or systems, and the script that repeats them."""
 
 from __future__ import annotations
 

@@ -243,7 +243,7 @@ def servo_bandwidth(
     """
     peak = between(peak, "peak", 1.0, float("inf"), "No loop keeps |S| below 1: try 2.")
     task = servo_task(plant, poi, axes, rolloff, integrator, notches, observer)
-    return replace(task, sought=float(peak)).largest()
+    return replace(task, sought=float(peak)).largest(float(peak))
 
 
 def _refuse(closed: ClosedLoop, at: str, observed: bool, advice: str) -> None:
@@ -366,9 +366,11 @@ class ServoTask:
         return bool(np.any(seen < _NEAR * law.driven.freq.min()))
 
     def _runs(self, law: ServoLaw) -> bool:
-        """Return whether the loop is stable, with the truncated modes where they are known."""
+        """Return whether the loop is stable, with the truncated modes where they are known.
+
+        In a search these decide only where a law may hold the peak that is sought.
+        """
         stable = self.radius(law) < 1.0
-        # a search refuses a law with a higher peak in any case
         refused = self.sought is not None and self.loop.peak(law)[0] > max(self.sought, TARGET)
         if not stable or refused or self.plant.evaluation_plant is None:
             return stable
@@ -513,9 +515,8 @@ class ServoTask:
 
         return found
 
-    def largest(self) -> float:
-        """Return the largest bandwidth that holds the peak of |S| at u that is sought."""
-        peak = self.sought or TARGET
+    def largest(self, peak: float) -> float:
+        """Return the largest bandwidth that holds a peak of |S| at u."""
         best: tuple[float, float, float] = (np.inf, np.nan, np.nan)
 
         def fine(loop: ClosedLoop) -> bool:

@@ -203,7 +203,7 @@ class _BoundFrf(Bound):
             left = max(nu - 2.0, LEAST - 1.0)
             self.independent *= left / (nu - 1.0 + shared)
             # with weights 1/s^2 of estimated variances s^2 it is mean(1/s^4) / mean(1/s^2)^2
-            self.scatter = max(nu - 1.0, 1.0) / left
+            self.scatter = max(nu - 1.0, LEAST) / left
         whole = 1 / sigma
         if not self.magnitude:
             whole = np.sqrt(np.mean(np.abs(self.data) ** 2, axis=0)) / sigma
