@@ -117,7 +117,7 @@ class NormalForm(Value):
 
 
 def overdamped_notes(form: NormalForm, rate: float) -> tuple[str, ...]:
-    """Warn of overdamped poles up to `rate` [1/s]; return the note, empty if there are none."""
+    """Warn of overdamped poles up to `rate` [1/s]; return the note, empty without any."""
     note = form.overdamped_below(rate)
     if not note:
         return ()

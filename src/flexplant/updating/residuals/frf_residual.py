@@ -55,7 +55,8 @@ class FrfResidual(Residual):
         Variance ``E|noise|^2`` of each entry. None: the variance of `measured`. If
         `measured.freedom` gives the number nu of degrees of freedom with which this variance was
         estimated, the variance is multiplied by ``nu / (nu - 1)``, and the covariance of the
-        parameters by ``(nu - 1) / (nu - 2)``, since the weights of the lines are uncertain. The
+        parameters by ``(nu - 1) / (nu - 2)``, since the weights of the lines are uncertain (by at
+        most 3: with nu of 2 or less the uncertainty depends on the number of lines). The
         correlation of neighbouring lines follows from the window of the Frf, and that of outputs
         from its `correlation`. Both count in the covariance and in chi-square. If no variance is
         known, each entry is divided by the rms of its channel pair.
