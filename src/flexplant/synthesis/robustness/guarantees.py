@@ -21,7 +21,7 @@ from ...parallel import Progress, one_thread
 from ...plant import AnyPlant
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...store import Value
-from ...tolerances import CLOSE, FOUR_DIGITS, MOST_STEPS, NEGLIGIBLE, TYPED
+from ...tolerances import CLOSE, FOUR_DIGITS, MOST_STEPS, NEGLIGIBLE, ROUNDING, TYPED
 from ..hinf.tolerated_modes import mode_channels, tolerated, with_mode_channels
 from .lower import Destabilising, crossing_multiple, destabilising
 from .mu_bounds import INTERVALS, SOUGHT, Cover, Covered, sought
@@ -424,8 +424,11 @@ def worst_case_gain(
     unit = np.ones((len(g.outputs), 1))
     unit[-loop.performance.z :] = 1.0 / size
     M = g.replace(C=unit * g.C, D=unit * g.D)
+    leveled = [*[False] * len(loop.blocks), True]
+    # no level is below the nominal gain, which is one in these units
+    least = 1.0 if nominal else ROUNDING
     with Progress(None, INTERVALS, progress=progress):
-        found = Cover(M, listed, [*[False] * len(loop.blocks), True], loop.heights).run()
+        found = Cover(M, listed, leveled, loop.heights, least).run()
     if not np.isfinite(found.level):
         raise AssumptionError(
             "machines of the uncertainty may be unstable (at "

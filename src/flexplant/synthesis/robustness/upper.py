@@ -60,7 +60,7 @@ def upper_level(
         if found is None:
             return Certified(np.inf, x)
         x, reached = found, reached_level(W, scalings, found)
-    if scalings.skewed:
+    if scalings.skewed and reached > enough:
         return _skewed(W, scalings, x, reached, enough)
     x = x / np.sum(scalings.start * x)
     best = Certified(max(reached, 0.0), x)
