@@ -327,7 +327,8 @@ class Cover:
 
     def _raise(self, M: ComplexArray, omega: float) -> FloatArray:
         """Return scalings that hold at a frequency; the level is raised where it is too low."""
-        enough = 0.97 * self.level
+        # what is closer than twice ABOVE raises the level; once more is left for frequencies around
+        enough = (1.0 - 3.0 * ABOVE) * self.level
         found = upper_level(M, self.scalings, self._nearest(omega), enough=enough, widest=WIDE)
         if found.level > enough and self.shares:  # the level is raised only by what no G lowers
             freer = upper_level(M, self.scalings, found.x, enough=enough)
