@@ -13,11 +13,12 @@ from flexplant.loop.broken import sensitivity
 from flexplant.lti import StateSpace
 from flexplant.modes import solve_modes
 from flexplant.plant import Actuator, Disturbance, Poi, Ports, Reference, Sensor, assemble_plant
+from flexplant.plant.axes import gains_at
 from flexplant.structure import FEModel, ModalDamping, chain
 from flexplant.synthesis import design_servo, servo_bandwidth
 from flexplant.synthesis.laws.servo_design import servo_task
-from flexplant.synthesis.laws.servo_loops import verified_suppression
-from flexplant.testbeds import three_masses, wafer_stage
+from flexplant.synthesis.laws.servo_loops import Notched, verified_suppression
+from flexplant.testbeds import flexible_joint, gantry, three_masses, wafer_stage
 from oracles_plant import closed_loop
 from stages import RATE, block, calibrated, ports, reduced, sampled
 
@@ -212,10 +213,10 @@ def test_search_and_certificate_break_the_same_loop():
             )
 
 
-def test_a_bandwidth_between_unstable_ones_is_found():
-    """A chain that holds 6 dB near 46 Hz, below 10.5 Hz, and at none between."""
+def four_masses():
+    """Four masses of which the second carries motor and sensor."""
     model = chain(masses=[6.71, 0.28, 0.58, 0.66], stiffnesses=[80727.0, 4437.0, 1297281.0])
-    plant = assemble_plant(
+    return assemble_plant(
         solve_modes(model, count=4, damping=ModalDamping(0.0011)),
         Ports(
             w=[Disturbance("w", at="2:x", asd=1e-3)],
@@ -225,9 +226,40 @@ def test_a_bandwidth_between_unstable_ones_is_found():
             references=[Reference("die")],
         ),
     ).discretized(5382.0, delay=1)
+
+
+def test_a_bandwidth_between_unstable_ones_is_found():
+    """A chain that holds 6 dB near 46 Hz, below 10.5 Hz, and at none between."""
+    plant = four_masses()
     reach = servo_bandwidth(plant)
     assert 40.0 < reach < 55.0
     assert design_servo(plant, bandwidth=reach).certificate["modulus margin"] >= 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [four_masses, gantry, flexible_joint])
+def test_no_set_of_notches_that_was_ruled_out_serves_better(make):
+    """Every set is judged by the closed loop itself, from frequencies far too high to low ones."""
+    plant = make()
+    task, counts = servo_task(plant, None, None, None, None, None, None), []
+    for bandwidth in np.geomspace(0.05, 5e-4, 8) / plant.dt:
+        driven = task.driven(float(bandwidth))
+        plain = task._plain(driven, np.abs(gains_at(plant, driven)))[0]
+        found = task.loop.notched(plain, plain, False, 4.0)
+        sets = Notched.all(plain, task.loop._options(plain))
+        laws = [sets.some(slice(i, i + 1)).first for i in range(len(sets.chosen))]
+        margins = np.array([task.closed(law).modulus_margin for law in laws])
+        fewest = np.array([len(law.notches) for law in laws])
+        if found is None:
+            assert margins.max() < 0.26
+            continue
+        own = task.closed(found).modulus_margin
+        counts.append(len(found.notches))
+        like = fewest <= len(found.notches) if own >= 0.5 else fewest >= 0
+        assert own >= 0.97 * margins[like].max()
+        if own >= 0.5:
+            assert margins[fewest < len(found.notches)].max(initial=0.0) < 0.515
+    assert len(set(counts)) > 1  # some bandwidths need more notches than others
 
 
 def test_where_the_estimate_leans_on_the_model_a_bandwidth_is_found():

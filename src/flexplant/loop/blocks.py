@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from itertools import combinations
 from typing import Any
 
@@ -14,9 +15,10 @@ from ..lti.blocks_of_states import equal_matrices
 from ..lti.interconnection import among, connect
 from ..lti.response_solvers import Responder, responder
 from ..lti.statespace import StateSpace
-from ..plant import AnyPlant
+from ..plant import AnyPlant, EvaluationModel, Foreign, StandardPlant
+from ..plant.axes import Reading
 from ..plant.port import DERIVATIVES
-from ..tolerances import SAME
+from ..tolerances import KEPT_PLANTS, SAME
 from .anti_windup import recovery_gain
 
 
@@ -268,3 +270,50 @@ def applied_law(loop: Any, recovery: float | None) -> tuple[StateSpace, FloatArr
         own = np.flatnonzero(np.repeat(drives, [block.n_states for block in loop.blocks]))
         L[own] = recovery_gain(law.A[np.ix_(own, own)], law.C[:nu, own], recovery, 1.0)
     return law, L
+
+
+def observer_system(
+    observer: Any, plant: StandardPlant, estimates: Sequence[str]
+) -> StateSpace | None:
+    """Return the observer as a block of the plant, checked to give the estimates."""
+    if observer is None:
+        return None
+    inner = as_block(observer, "the observer", plant.dt)
+    missing = [name for name in estimates if name not in inner.outputs]
+    if missing:
+        raise LabelError(
+            f"the observer gives {', '.join(inner.outputs[:6])}, but the servo acts on "
+            f"{', '.join(missing)} too. Design it on this plant, or rename its outputs."
+        )
+    unknown = [name for name in inner.inputs if name not in (*plant.y, *plant.u)]
+    if unknown:
+        raise LabelError(
+            f"the observer reads {', '.join(unknown)}, which the plant has neither in y nor in u."
+        )
+    return inner
+
+
+def path_of(plant: StandardPlant, observer: StateSpace | None, reading: Reading) -> StateSpace:
+    """Return the system from u to what a servo reads."""
+    if observer is None:
+        return plant.system.select(reading.channels, plant.u)
+    reads = list(reading.reads.values())
+    read = [one for one in plant.y if one in (*observer.inputs, *reads)]
+    return connect([plant.system.select(read, plant.u), observer], plant.u, reads)
+
+
+@lru_cache(maxsize=KEPT_PLANTS)
+def seeing(plant: StandardPlant, reading: Reading) -> StandardPlant:
+    """Return the plant whose y are the references and the axes themselves, named as read."""
+    g, nz = plant.system, len(plant.z)
+    names = (*plant.z, *plant.y)
+    own = [names.index(channel) for channel in reading.channels]
+    kept = [i for i, name in enumerate(plant.y) if name.endswith(":ref")]
+    rows = [*range(nz), *own, *(nz + i for i in kept)]
+    y = (*reading.reads.values(), *(plant.y[i] for i in kept))
+    system = g.replace(C=g.C[rows], D=g.D[rows], outputs=[*plant.z, *y])
+    whole = plant.evaluation_plant
+    return StandardPlant(
+        system, plant.w, plant.u, plant.z, y, {}, Foreign(delay=plant.delay),
+        evaluation=EvaluationModel.of(whole and seeing(whole, reading)),
+    )  # fmt: skip

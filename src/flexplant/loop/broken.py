@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property, lru_cache
 from typing import Any, Literal, NamedTuple
@@ -414,6 +414,13 @@ def first_crossing(
         between = crossings(lambda f: find(f) - 1.0, freq[pair], size[pair] - 1.0)
         found = np.append(between, found)
     return float(found[0])
+
+
+def lowest_crossing(freq: FloatArray, sizes: Iterable[FloatArray]) -> float:
+    """Return the least frequency [Hz] at which one of some sizes of |S| first crosses 1."""
+    first, last = float(freq[0]), float(freq[-1])
+    crossings = (first_crossing(freq, one, None) if one.min() < 1.0 else first for one in sizes)
+    return min((min(one, last) for one in crossings), default=0.0)
 
 
 def crossing(loop: Any, reference: str, error: str, curve: tuple[FloatArray, FloatArray]) -> float:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import ComplexArray, FloatArray, divisor, name_list, positive
-from ..errors import AssumptionError, LabelError, ModelError, require_known, some_names
+from ..errors import AssumptionError, LabelError, ModelError, require_known, some_names, warn
 from ..lti.statespace import StateSpace
 from ..store import Value
 from ..tolerances import KEPT_PLANTS, TYPED
@@ -390,8 +390,8 @@ def states_at(g: StateSpace, B: FloatArray, s: complex) -> ComplexArray:
     # next to z = 1, with the difference of both, no digit of a slow pole is lost
     shift = np.expm1(s * g.dt) if g.dt else s
     eye = np.eye(g.n_states)
-    pencil = shift * eye - (g.A - eye if g.dt else g.A)
-    return np.asarray(np.linalg.solve(pencil, B.astype(np.complex128)))
+    pencil = (shift if np.imag(shift) else np.real(shift)) * eye - (g.A - eye if g.dt else g.A)
+    return np.asarray(np.linalg.solve(pencil, B), dtype=np.complex128)
 
 
 def elastic(plant: Partition) -> FloatArray:
@@ -405,3 +405,53 @@ def oscillations(plant: Partition) -> tuple[FloatArray, FloatArray]:
     freq = omega / (2.0 * np.pi)
     seen = (freq > 0) & (freq * plant.dt < 0.45)  # unstable pairs do not resonate
     return np.asarray(freq[seen]), np.asarray(damping[seen])
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """What a servo reads for each axis: the estimate of a POI's, or the sensor itself."""
+
+    channels: tuple[str, ...]
+    #: of the channel: its estimate or sensor, and its reference where there is one
+    reads: Mapping[str, str]
+    references: Mapping[str, str]
+
+    @property
+    def estimates(self) -> list[str]:
+        """What an observer has to give."""
+        return [one for channel, one in self.reads.items() if one != channel]
+
+    def warn_of_held(self, axes: Sequence[str] | None) -> None:
+        """Warn of sensors that stand for a motion that no POI shows, where axes are not given."""
+        held = [channel for channel, one in self.reads.items() if one == channel]
+        if axes is None and held and self.references:
+            warn(
+                "no axis of a POI shows a free motion that the actuators move, so that the servo "
+                f"holds {', '.join(held)} at zero, also while references move the POIs. Add a Poi "
+                "that shows this motion to move otherwise, or name the axes, axes=[...]."
+            )
+
+
+@lru_cache(maxsize=KEPT_PLANTS)
+def reading_of(plant: Partition, channels: tuple[str, ...]) -> Reading:
+    """Return what a servo on some channels reads."""
+    every = plant.assembled.ports.z
+    ports = {poi.channel(axis): (poi, axis) for poi in every for axis in poi.axes}
+    hats = {
+        name: ports[name][0].derived(ports[name][1], "hat") for name in channels if name in ports
+    }
+    refs = {name: ports[name][0].derived(ports[name][1], "ref") for name in hats}
+    return Reading(
+        channels,
+        {name: hats.get(name, name) for name in channels},
+        {name: ref for name, ref in refs.items() if ref in plant.y},
+    )
+
+
+def gains_at(
+    plant: Partition, axes: DrivenAxes, freq: FloatArray | ComplexArray | None = None
+) -> ComplexArray:
+    """Return the responses (r,) of the decoupled axes, at their frequencies [Hz] or at others."""
+    at = 2j * np.pi * (axes.freq if freq is None else freq)
+    gains = {s: complex_gain(plant.system, s, axes.channels, axes.actuators) for s in set(at)}
+    return np.array([gains[s][i] @ axes.T[:, i] for i, s in enumerate(at)])

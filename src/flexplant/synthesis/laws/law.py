@@ -275,7 +275,7 @@ class Law(LawElement):
         """
         return self.at(sampled_freq(freq, 1.0 / self.rate if self.rate else 0.0))
 
-    def at(self, freq: FloatArray) -> ComplexArray:
+    def at(self, freq: FloatArray | ComplexArray) -> ComplexArray:
         """Return the response at frequencies [Hz] in any order. The frequencies are not checked."""
         return self.gain * product(self._sections, tustin_s(freq, self.rate))
 
@@ -551,7 +551,7 @@ def decoupled(laws: Iterable[Matrices], before: FloatArray, after: FloatArray) -
     return A, -B @ after, before @ C, -before @ D @ after
 
 
-def tustin_s(freq: FloatArray | float, rate: float) -> ComplexArray:
+def tustin_s(freq: FloatArray | ComplexArray | float, rate: float) -> ComplexArray:
     """Return ``2 rate (z - 1) / (z + 1)`` at frequencies [Hz]; j omega of a continuous law."""
     omega = 2.0 * rate * np.tan(np.pi * freq / rate) if rate else 2.0 * np.pi * freq
     return np.asarray(1j * omega, dtype=np.complex128)

@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
 
-from ...arrays import ComplexArray, FloatArray, below_half_rate, between, positive, real_array
+from ...arrays import FloatArray, below_half_rate, between, positive, real_array
 from ...certificates import Certificate, Verified, stability_check
 from ...errors import ModelError, SolverError, warn
 from ...loop import ClosedLoop
-from ...loop.blocks import drives, driving_blocks
+from ...loop.blocks import drives, driving_blocks, observer_system, seeing
 from ...loop.other_machines import growing_modes, modes_in_words, warn_of_critical
 from ...lti.frequency_sweep import resonance_grid
 from ...lti.interconnection import loop_poles, series, side_by_side
-from ...lti.minimal_realisations import minimal
 from ...lti.statespace import StateSpace
 from ...parallel import one_thread
 from ...plant import StandardPlant, standard_plant
-from ...plant.axes import DrivenAxes, driven_axes, elastic
+from ...plant.axes import DrivenAxes, Reading, driven_axes, elastic, gains_at, reading_of
 from ...plant.partitioned import require_sampled
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ..controller import CLOSE, Controller, with_checks
@@ -30,19 +29,14 @@ from .servo_loops import (
     LEADS,
     POWERS,
     TARGET,
+    WITHIN,
     Axis,
-    Reading,
     ServoLaw,
     ServoLoop,
     combinations,
-    gains_at,
     highest_bandwidth,
     known_axis,
     lines_of,
-    observer_system,
-    path_of,
-    reading_of,
-    seeing,
     servo_loop,
     verified_suppression,
 )
@@ -106,9 +100,10 @@ def design_servo(
         lower if |S| at u would otherwise rise by more than 10 %. On springs it is up to half the
         bandwidth, if |S| at a twentieth of the bandwidth would otherwise exceed 0.3.
     notches : sequence of float [Hz], optional
-        Frequencies of resonances to notch, each below half the rate. By default they are modes of
-        the plant. They are added one by one while |S| at u is above 6 dB (or the loop is unstable)
-        and a notch lowers it. An empty sequence means a law without notches.
+        Frequencies of resonances to notch, each below half the rate. By default they are up to five
+        modes of the plant, those at which the loop resonates most: the fewest notches with which
+        |S| at u stays below 6 dB, else those with the lowest peak. Above 18 dB there are none. An
+        empty sequence means a law without notches.
     observer : KalmanEstimator, StaticEstimator or StateSpace, optional
         Block whose outputs are the estimates `die:hat`, ...; by default the loop is checked with
         the true motion of the POI in their place.
@@ -209,12 +204,13 @@ def servo_bandwidth(
 ) -> float:
     """Return the largest bandwidth [Hz] at which `design_servo` keeps |S| at u below a peak.
 
-    The responses of plant and observer are computed once on a grid that includes resonances. The
-    loop is opened at the plant's input; the observer still receives u. Bandwidths are tried from
-    high to low in steps of 9 %. A bandwidth that keeps the peak on the grid is accepted if the
-    closed loop is stable, its modulus margin is at least 1 / peak, and every axis with a reference
-    has |S| of at most 0.3 at a twentieth of the bandwidth. Truncated modes are included if known. A
-    bisection then searches above the accepted bandwidth.
+    The responses of plant and observer are computed once on a grid that includes resonances, and
+    the loop is opened at the plant's input; the observer still receives u. Bandwidths are tried
+    from high to low in steps of 9 %, then by bisection. One holds the peak if the closed loop is
+    stable, its modulus margin is at least 1 / peak, and every axis with a reference has |S| of at
+    most 0.3 at a twentieth of the bandwidth. The result is verified with the law that
+    `design_servo` gives, with the truncated modes if they are known; where these do not allow it,
+    the search is repeated with them.
 
     Parameters
     ----------
@@ -243,7 +239,7 @@ def servo_bandwidth(
     """
     peak = between(peak, "peak", 1.0, float("inf"), "No loop keeps |S| below 1: try 2.")
     task = servo_task(plant, poi, axes, rolloff, integrator, notches, observer)
-    return replace(task, sought=float(peak)).largest(float(peak))
+    return task.largest(float(peak))
 
 
 def _refuse(closed: ClosedLoop, at: str, observed: bool, advice: str) -> None:
@@ -263,6 +259,8 @@ def _refuse(closed: ClosedLoop, at: str, observed: bool, advice: str) -> None:
 #: bandwidths that `ServoTask.largest` tries, from 0.19 of the rate down to a part of it below
 #: which loops lose digits, before it halves intervals
 _TRIALS, _SLOWEST = 80, 2e-4
+#: of these trials each eighth is designed to say why none holds
+_ASKED = 8
 #: roll-off relative to the bandwidth: on a spring the integrator leaves more phase for it; that of
 #: a wide lead is its pole
 _ROLLOFF = {"mass": 8.0, "damper": 8.0, "speed": 8.0, "spring": 3.0}
@@ -274,6 +272,8 @@ _INTEGRATOR, _BELOW_ZERO = 0.1, 0.32
 _CORNERS, _COST = (0.5, 0.2, 0.1, 0.05, 0.02), 1.1
 #: wide leads are tried where the loop resonates above the bandwidth within this factor
 _NEAR = 4.0
+#: |S| on the grid above which no notches are sought: 18 dB
+_POOR = 8.0
 #: |S| that an axis is to have at this fraction of its bandwidth, as a mass has with the usual lead
 _WELL_BELOW, _SUPPRESSED = 20.0, 0.3
 #: a bandwidth is next to a resonance when a mode lies within this of it, and the gain of the axis
@@ -291,8 +291,7 @@ class ServoTask:
     integrator: float | None
     notches: tuple[float, ...] | None
     observer: StateSpace | None
-    #: peak of |S| at u that a search asks for. It judges many loops: poles that no law moves are
-    #: found once and left out
+    #: peak of |S| at u that a search asks for: laws that do not hold it are None
     sought: float | None = None
 
     @property
@@ -312,7 +311,16 @@ class ServoTask:
         return servo_loop(whole, self.observer, self.reading, self.plant)
 
     def law(self, bandwidth: float | Mapping[str, float]) -> ServoLaw:
-        """Return the laws of the axes, with the notches that were given."""
+        """Return the laws of the axes; without notches where none are stable and good enough."""
+        driven = self.driven(bandwidth)
+        if (found := self.found(driven)) is not None:
+            return found
+        plain = self._plain(driven, np.abs(gains_at(self.plant, driven)))
+        stable = [one for one in plain if self.loop.radius(one) < 1.0]
+        return self._lowest(stable) or min(plain, key=self.loop.radius)
+
+    def driven(self, bandwidth: float | Mapping[str, float]) -> DrivenAxes:
+        """Return the axes, decoupled at the bandwidth."""
         wanted = bandwidth if isinstance(bandwidth, Mapping) else positive(bandwidth, "bandwidth")
         driven = driven_axes(self.plant, freq=wanted, axes=self.channels)
         for f in driven.freq:
@@ -321,44 +329,56 @@ class ServoTask:
                     f"bandwidth {f:g} Hz is not well below the rate, {self.rate:g} Hz: the law "
                     f"needs room above it. Stay below {0.2 * self.rate:g} Hz, or raise the rate."
                 )
+        return driven
+
+    def found(self, driven: DrivenAxes) -> ServoLaw | None:
+        """Return the law that serves best, None without one that is stable and good enough."""
         exact, smooth = np.abs(gains_at(self.plant, driven)), (2.0 * np.pi * driven.freq) ** -2.0
-        best, modes = self._law(self._plain(driven, exact)), elastic(self.plant)[:, None]
+        best, modes = self._law(driven, exact), elastic(self.plant)[:, None]
         # next to a resonance the response says little of the axis: that on the real axis does
         near = np.any(np.abs(np.log(modes / driven.freq)) < _RESONANT, axis=0)
-        if not np.any(near & (np.abs(np.log(exact / smooth)) > _RESONANT)) or self._serves(best):
-            return best
-        other = self._plain(driven, smooth)
-        if self.radius(other) < 1.0 and self._serves(other := self._law(other)):
-            return other
+        if np.any(near & (np.abs(np.log(exact / smooth)) > _RESONANT)) and not self._serves(best):
+            other = self._law(driven, smooth)
+            return other if self._serves(other) else best
         return best
 
-    def _plain(self, driven: DrivenAxes, gains: FloatArray) -> ServoLaw:
-        """Return the laws, without notches, on the best lines of axes with these gains."""
+    def _plain(self, driven: DrivenAxes, gains: FloatArray) -> list[ServoLaw]:
+        """Return the laws, as they are given, on lines of axes with these gains.
+
+        Of lines that leave no phase only the most likely.
+        """
         notches, level = tuple(map(Notch, self.notches or ())), tuple(gains.tolist())
         tried = [
             ServoLaw(driven, tuple(map(self.axis, lines, driven.freq.tolist())), level, notches)
             for lines in combinations(lines_of(self.plant, driven))
         ]
-        able = [one for one in tried if self.phase_margins(one).min() > 0.0]
-        return self._best(able) if able else tried[0]
+        return [one for one in tried if self.phase_margins(one).min() > 0.0] or tried[:1]
 
-    def _law(self, plain: ServoLaw) -> ServoLaw:
-        """Return the law with notches, lead and integral action."""
-        if self.phase_margins(plain).min() <= 0.0:
-            return plain
-        best = self._settling(self.notched(plain))
-        if all(axis.line != "mass" for axis in plain.axes):
-            return best
-        for lead in LEADS[1:]:
+    def _law(self, driven: DrivenAxes, gains: FloatArray) -> ServoLaw | None:
+        """Return the law with lines, notches, lead and integral action, None without a good one."""
+        plain = self._plain(driven, gains)
+        if self.phase_margins(plain[0]).min() <= 0.0:
+            return None
+        best = self._lowest(self._notched(one, one) for one in plain)
+        best = best and self._settling(best)
+        mass = next((one for one in plain if any(axis.line == "mass" for axis in one.axes)), None)
+        for lead in LEADS[1:] if mass else ():
             # the widest leads only where the others do not serve: they cost most noise
-            if self._holds(best, TARGET) and not (lead == LEADS[1] and self._resonates(plain)):
+            resonates = lead == LEADS[1] and self._resonates(plain[0])
+            if mass is None or (best and not resonates and self._holds(best, WITHIN * TARGET)):
                 break
-            axes = (self.axis(a.line, a.bandwidth, lead) for a in plain.axes)
-            wide = self.notched(plain.of(axes))
-            if self._best([best, wide]) is wide and self._runs(wide):
+            axes = (self.axis(a.line, a.bandwidth, lead) for a in mass.axes)
+            wide = self._notched(mass.of(axes), mass)
+            if wide and self._lowest([best, wide]) is wide and self._runs(wide):
                 wide = self._settling(wide)
-                best = wide if self._suppresses(wide) or not self._suppresses(best) else best
+                serves = best and self._holds(best, TARGET) and self._suppresses(best)
+                best = best if serves and not self._suppresses(wide) else wide
         return best
+
+    def _lowest(self, laws: Iterable[ServoLaw | None]) -> ServoLaw | None:
+        """Return the law with the lowest peak of |S| at u, None without any."""
+        known = [law for law in laws if law]
+        return min(known, key=lambda law: self.loop.peak(law)[0], default=None)
 
     def _resonates(self, law: ServoLaw) -> bool:
         """Return whether the loop of a law resonates a little above the bandwidth."""
@@ -366,24 +386,20 @@ class ServoTask:
         return bool(np.any(seen < _NEAR * law.driven.freq.min()))
 
     def _runs(self, law: ServoLaw) -> bool:
-        """Return whether the loop is stable, with the truncated modes where they are known.
+        """Return whether the loop is stable with the truncated modes, where they are known.
 
-        In a search these decide only where a law may hold the peak that is sought.
+        A search skips this check: `largest` makes it for the result.
         """
-        stable = self.radius(law) < 1.0
-        refused = self.sought is not None and self.loop.peak(law)[0] > max(self.sought, TARGET)
-        if not stable or refused or self.plant.evaluation_plant is None:
-            return stable
-        loop = self.closed(law)
-        return (loop.completed or loop).is_stable
+        whole = None if self.sought else self.closed(law).completed
+        return whole is None or whole.is_stable
 
-    def _serves(self, law: ServoLaw) -> bool:
+    def _serves(self, law: ServoLaw | None) -> bool:
         """Return whether a law holds 6 dB and follows its references."""
-        return self._holds(law, TARGET) and self._suppresses(law, followed=True)
+        return law is not None and self._holds(law, TARGET) and self._suppresses(law, followed=True)
 
     def _holds(self, law: ServoLaw, peak: float) -> bool:
         """Return whether the loop of a law is stable with |S| at u below a peak, on the grid."""
-        return self.radius(law) < 1.0 and self.loop.peak(law)[0] <= peak
+        return self.loop.radius(law) < 1.0 and self.loop.peak(law)[0] <= peak
 
     def _suppresses(self, law: ServoLaw, followed: bool = False) -> bool:
         """Return whether every axis, or that with a reference, suppresses errors at a twentieth."""
@@ -395,7 +411,7 @@ class ServoTask:
 
     def _suppressed_up_to(self, law: ServoLaw) -> float:
         """Return `ServoLoop.suppressed_up_to` of the plant, on a grid through its resonances."""
-        grid = resonance_grid(loop_poles(self.whole, law.matrices), self.plant.dt)
+        grid = resonance_grid(loop_poles(self.loop.path, law.matrices), self.plant.dt)
         return replace(self.loop, freq=grid, plant=self.plant).suppressed_up_to(law)
 
     def _settling(self, law: ServoLaw) -> ServoLaw:
@@ -415,11 +431,6 @@ class ServoTask:
                     return one
         return law
 
-    def _best(self, laws: Sequence[ServoLaw]) -> ServoLaw:
-        """Return the law with the lowest peak of |S| at u among those whose loop is stable."""
-        stable = [law for law in laws if self.radius(law) < 1.0] if len(laws) > 1 else laws
-        return self.loop.lowest(stable) if stable else min(laws, key=self.radius)
-
     def axis(self, line: str, bandwidth: float, lead: float = LEADS[0]) -> Axis:
         """Return the law of an axis on a line."""
         wide = line == "mass" and lead != LEADS[0]
@@ -432,12 +443,10 @@ class ServoTask:
         own_lead = lead if wide else LEADS[0]
         return known_axis(line, bandwidth, float(rolloff), self.rate, own_lead, float(slow))
 
-    @cached_property
-    def notched(self) -> Callable[[ServoLaw], ServoLaw]:
-        """The function of a law that gives it with notches where they serve, or as given."""
-        if self.notches is not None:
-            return lambda law: law
-        return cache(lambda law: self.loop.notched(law, self.poles))
+    def _notched(self, law: ServoLaw, plain: ServoLaw) -> ServoLaw | None:
+        """Return a law with notches where they serve, or as given; None if none is good enough."""
+        most = max(self.sought, TARGET) if self.sought else _POOR
+        return self.loop.notched(law, plain, self.notches is not None, most)
 
     def phase_margins(self, law: ServoLaw) -> FloatArray:
         """Return the phases [rad] (r,) that remain of -pi at the bandwidth, on each axis's line."""
@@ -476,30 +485,6 @@ class ServoTask:
         return system.replace(name="servo", units=self.plant.units)
 
     @cached_property
-    def whole(self) -> StateSpace:
-        """From u to what the servo reads."""
-        return path_of(self.plant, self.observer, self.reading)
-
-    @cached_property
-    def path(self) -> tuple[StateSpace, float]:
-        """From u to what the servo reads, and the largest size of a pole left out of it."""
-        if self.sought is None:
-            return self.whole, 0.0
-        kept, fixed = minimal(self.whole), self.whole.poles()
-        for pole in kept.poles():
-            fixed = np.delete(fixed, np.argmin(np.abs(fixed - pole)))
-        return kept, float(np.abs(fixed).max(initial=0.0))
-
-    @cached_property
-    def poles(self) -> Callable[[ServoLaw], ComplexArray]:
-        """The function of a law that gives the poles of its loop."""
-        return cache(lambda law: loop_poles(self.path[0], law.matrices))
-
-    def radius(self, law: ServoLaw) -> float:
-        """Return the spectral radius of the loop of a law."""
-        return max(float(np.abs(self.poles(law)).max()), self.path[1])
-
-    @cached_property
     def closed(self) -> Callable[[ServoLaw], ClosedLoop]:
         """The function of a law that gives the loop that will run."""
         plant = self.plant
@@ -517,42 +502,60 @@ class ServoTask:
 
     def largest(self, peak: float) -> float:
         """Return the largest bandwidth that holds a peak of |S| at u."""
-        best: tuple[float, float, float] = (np.inf, np.nan, np.nan)
+        # laws above the peak need not be found, but above 18 dB they are others
+        task = replace(self, sought=peak if peak <= _POOR else None)
 
-        def fine(loop: ClosedLoop) -> bool:
-            return loop.modulus_margin >= 1.0 / peak
+        def fine(loop: ClosedLoop | None) -> bool:
+            return loop is None or loop.modulus_margin >= 1.0 / peak
 
-        def holds(bandwidth: float) -> bool:
-            nonlocal best
+        def holds(law: ServoLaw | None) -> bool:
+            if law is None or self.loop.radius(law) >= 1.0 or self.loop.peak(law)[0] > peak:
+                return False
+            return self._suppresses(law, followed=True) and fine(self.closed(law))
+
+        @cache
+        def likely(bandwidth: float) -> bool:
+            law = task.found(task.driven(bandwidth)) if task.sought else task.law(bandwidth)
+            return holds(law)
+
+        @cache
+        def proven(bandwidth: float) -> bool:
+            # by the law that is designed: another one where truncated modes allow no wide lead
             law = self.law(bandwidth)
-            if self.phase_margins(law).min() <= 0.0 or self.radius(law) >= 1.0:
-                return False
-            size, at = self.loop.peak(law)
-            if size < best[0]:
-                best = size, at, bandwidth
-            if size > peak or not self._suppresses(law, followed=True):
-                return False
-            closed = self.closed(law)
-            # the loop on the evaluation model, which costs most, only if the smaller loop is good
-            return fine(closed) and (closed.completed is None or fine(closed.completed))
+            return holds(law) and fine(self.closed(law).completed)
 
-        trials = np.geomspace(0.19 * self.rate, _SLOWEST * self.rate, _TRIALS)
-        found = highest_bandwidth(trials.tolist(), holds)
+        trials = np.geomspace(0.19 * self.rate, _SLOWEST * self.rate, _TRIALS).tolist()
+        found = highest_bandwidth(trials, likely)
+        if found and not proven(found):
+            found = highest_bandwidth(trials, lambda one: likely(one) and proven(one))
         if found is None:
             raise SolverError(
                 f"no bandwidth from {trials[-1]:.3g} to {trials[0]:.3g} Hz holds |S| at u below "
-                f"{20 * np.log10(peak):.2g} dB{self._why(peak, *best)}"
+                f"{20 * np.log10(peak):.2g} dB{self._why(peak, trials[::_ASKED])}"
             )
         return found
 
-    def _why(self, peak: float, size: float, at: float, bandwidth: float) -> str:
+    def _why(self, peak: float, trials: Sequence[float]) -> str:
         """Return what is nearest to holding a peak, what stops it and what to change, in words."""
-        if not np.isfinite(size):
+        tried = [(self.law(bandwidth), bandwidth) for bandwidth in trials]
+        stable = [one for one in tried if self.loop.radius(one[0]) < 1.0]
+        if not stable:
             return (
                 ": none gives a stable loop. Check the observer's signs and units, or design it "
                 "on this plant."
             )
-        left = float(np.rad2deg(self.phase_margins(self.law(bandwidth)).min()))
+        able = [one for one in stable if self._suppresses(one[0], followed=True)]
+        if not able:
+            return (
+                f": none of {len(trials)} bandwidths that were asked follows its references with "
+                f"|S| below {_SUPPRESSED} at a twentieth of the bandwidth. Move the observer's "
+                "noise intensities towards the sensors, or control other axes."
+            )
+        law, bandwidth = min(able, key=lambda one: self.loop.peak(one[0])[0])
+        size, at = self.loop.peak(law)
+        if margin := self.closed(law).modulus_margin:
+            size = max(size, 1.0 / margin)
+        left = float(np.rad2deg(self.phase_margins(law).min()))
         taken = 360.0 * bandwidth * self.plant.dt * (0.5 + self.plant.delay)
         asked = float(np.rad2deg(2.0 * np.arcsin(0.5 / peak)))
         cause = (
@@ -564,8 +567,8 @@ class ServoTask:
             "observer's noise intensities, give each axis its bandwidth in design_servo"
         )
         return (
-            f"; the least is {20 * np.log10(size):.3g} dB, of {bandwidth:.3g} Hz, at {at:.4g} Hz. "
-            f"There {cause}, or raise peak=."
+            f"; the least found is {20 * np.log10(size):.3g} dB, of {bandwidth:.3g} Hz, at "
+            f"{at:.4g} Hz. There {cause}, or raise peak=."
         )
 
 
