@@ -245,7 +245,7 @@ def test_no_set_of_notches_that_was_ruled_out_serves_better(make):
     for bandwidth in np.geomspace(0.05, 5e-4, 8) / plant.dt:
         driven = task.driven(float(bandwidth))
         plain = task._plain(driven, np.abs(gains_at(plant, driven)))[0]
-        found = task.loop.notched(plain, plain, False, 4.0)
+        found = task.loop.notched(plain, False, 4.0)
         sets = Notched.all(plain, task.loop._options(plain))
         laws = [sets.some(slice(i, i + 1)).first for i in range(len(sets.chosen))]
         margins = np.array([task.closed(law).modulus_margin for law in laws])

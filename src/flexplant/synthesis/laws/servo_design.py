@@ -102,8 +102,8 @@ def design_servo(
     notches : sequence of float [Hz], optional
         Frequencies of resonances to notch, each below half the rate. By default they are up to five
         modes of the plant, those at which the loop resonates most: the fewest notches with which
-        |S| at u stays below 6 dB, else those with the lowest peak. Above 18 dB there are none. An
-        empty sequence means a law without notches.
+        |S| at u stays below 6 dB, else those with the lowest peak. If every peak is above
+        18 dB, no notches are used. An empty sequence means a law without notches.
     observer : KalmanEstimator, StaticEstimator or StateSpace, optional
         Block whose outputs are the estimates `die:hat`, ...; by default the loop is checked with
         the true motion of the POI in their place.
@@ -343,10 +343,7 @@ class ServoTask:
         return best
 
     def _plain(self, driven: DrivenAxes, gains: FloatArray) -> list[ServoLaw]:
-        """Return the laws, as they are given, on lines of axes with these gains.
-
-        Of lines that leave no phase only the most likely.
-        """
+        """Return the laws without chosen notches on lines that leave phase, or on the likeliest."""
         notches, level = tuple(map(Notch, self.notches or ())), tuple(gains.tolist())
         tried = [
             ServoLaw(driven, tuple(map(self.axis, lines, driven.freq.tolist())), level, notches)
@@ -359,7 +356,8 @@ class ServoTask:
         plain = self._plain(driven, gains)
         if self.phase_margins(plain[0]).min() <= 0.0:
             return None
-        best = self._lowest(self._notched(one, one) for one in plain)
+        plain = [one for one in plain if not self.loop.is_hopeless(one)]
+        best = self._lowest(map(self._notched, plain))
         best = best and self._settling(best)
         mass = next((one for one in plain if any(axis.line == "mass" for axis in one.axes)), None)
         for lead in LEADS[1:] if mass else ():
@@ -368,7 +366,7 @@ class ServoTask:
             if mass is None or (best and not resonates and self._holds(best, WITHIN * TARGET)):
                 break
             axes = (self.axis(a.line, a.bandwidth, lead) for a in mass.axes)
-            wide = self._notched(mass.of(axes), mass)
+            wide = self._notched(mass.of(axes))
             if wide and self._lowest([best, wide]) is wide and self._runs(wide):
                 wide = self._settling(wide)
                 serves = best and self._holds(best, TARGET) and self._suppresses(best)
@@ -443,10 +441,10 @@ class ServoTask:
         own_lead = lead if wide else LEADS[0]
         return known_axis(line, bandwidth, float(rolloff), self.rate, own_lead, float(slow))
 
-    def _notched(self, law: ServoLaw, plain: ServoLaw) -> ServoLaw | None:
+    def _notched(self, law: ServoLaw) -> ServoLaw | None:
         """Return a law with notches where they serve, or as given; None if none is good enough."""
         most = max(self.sought, TARGET) if self.sought else _POOR
-        return self.loop.notched(law, plain, self.notches is not None, most)
+        return self.loop.notched(law, self.notches is not None, most)
 
     def phase_margins(self, law: ServoLaw) -> FloatArray:
         """Return the phases [rad] (r,) that remain of -pi at the bandwidth, on each axis's line."""
@@ -538,7 +536,8 @@ class ServoTask:
     def _why(self, peak: float, trials: Sequence[float]) -> str:
         """Return what is nearest to holding a peak, what stops it and what to change, in words."""
         tried = [(self.law(bandwidth), bandwidth) for bandwidth in trials]
-        stable = [one for one in tried if self.loop.radius(one[0]) < 1.0]
+        able = [one for one in tried if self.phase_margins(one[0]).min() > 0.0]
+        stable = [one for one in able if self.loop.radius(one[0]) < 1.0]
         if not stable:
             return (
                 ": none gives a stable loop. Check the observer's signs and units, or design it "

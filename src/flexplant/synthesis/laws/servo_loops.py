@@ -9,9 +9,8 @@ from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from ...arrays import ComplexArray, FloatArray, IntArray
+from ...arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from ...loop import ClosedLoop
 from ...loop.blocks import path_of
 from ...loop.broken import (
@@ -33,7 +32,6 @@ from ...plant.axes import DrivenAxes, Reading, force_units, gains_at, oscillatio
 from ...tolerances import KEPT_PLANTS
 from .law import Integrator, Law, LowPass, Notch, Pid, decoupled, product, tustin_s
 
-Bools = npt.NDArray[np.bool_]
 #: the lead of a mass line: its zero lies this factor below the bandwidth, its pole above. With 4
 #: |S| of a free mass peaks near 4 dB with the roll-off and integrator of `design_servo`. Where a
 #: mode lies just above the bandwidth its notch takes phase, which wider leads give back
@@ -60,9 +58,8 @@ _KINDS = ((0.3, Notch(1.0).depth), (0.45, 0.0))
 #: fraction of TARGET that notches are to reach: the grid may miss the top of a resonance by 1 %
 WITHIN = 0.99
 #: these change only how long a search takes. A law gives five cuts, at the highest peaks of |S|.
-#: The last 30 are kept, and six rule out most sets. A law is first judged at each fourth point.
-#: After two laws the poles, which cost more, say whether others may serve
-_TOPS, _CUTS, _FIRST, _PART, _SOON = 5, 30, 6, 4, 2
+#: The last 30 are kept, and six rule out most sets. A law is first judged at each fourth point
+_TOPS, _CUTS, _FIRST, _PART = 5, 30, 6, 4
 #: a pole moves nearly in proportion to the gain for changes up to a half, of which 1 % shows how.
 #: It still grows if a third of its growth is left, by which the estimate may be wrong
 _SIMILAR, _SMALL, _STILL = 0.5, 0.01, 0.3
@@ -235,7 +232,7 @@ class Notched(NamedTuple):
     """A law with several sets of notches: at each of some modes none or one."""
 
     law: ServoLaw
-    #: notches, of which the first is none, and their gains (n_notches, r) at the bandwidths
+    #: None and the notches, and their gains (1 + n_notches, r) at the bandwidths
     notches: tuple[Notch | None, ...]
     gains: FloatArray
     #: of each set and mode the number of a notch
@@ -248,7 +245,7 @@ class Notched(NamedTuple):
         gains = np.array([np.ones(len(law.axes)), *(np.abs(law.there(one)) for one in notches)])
         return cls(law, (None, *notches), gains, _choices(tuple(map(len, options))))
 
-    def some(self, which: Bools | slice) -> Notched:
+    def some(self, which: BoolArray | slice) -> Notched:
         """Return some of the sets."""
         return self._replace(chosen=self.chosen[which])
 
@@ -444,25 +441,21 @@ class ServoLoop:
         return float(np.abs(self.poles(law)).max())
 
     def is_hopeless(self, law: ServoLaw) -> bool:
-        """Return whether the loop of a law has more unstable poles than notches may bring back."""
+        """Return whether a loop has more unstable poles than notches, a pair each, bring back."""
         return int(np.sum(np.abs(self.poles(law)) >= 1.0)) > 2 * _NOTCHES
 
-    def notched(self, law: ServoLaw, plain: ServoLaw, given: bool, most: float) -> ServoLaw | None:
+    def notched(self, law: ServoLaw, given: bool, most: float) -> ServoLaw | None:
         """Return a law with the fewest notches that bring |S| at u below 6 dB, and the lowest peak.
 
-        Without such notches it has those of the lowest peak, or is None where no peak is below
-        `most`, or the loop of the plain law is hopeless. All sets of notches are judged, or only
-        those that are `given`. What is known of others rules most of them out: points where |S| is
-        high, see `_exceed`, and poles that still grow, see `_grow`.
+        If no set of notches does so, the law with the lowest peak is returned, or None if no peak
+        is below `most`. All sets of notches are judged, or only those that are `given`. What is
+        known of others rules most of them out: points where |S| is high, see `_exceed`, and poles
+        that still grow, see `_grow`.
         """
         left, best = Notched.all(law, [] if given else self._options(law)), None
         for cuts in (self._cuts[:_FIRST], self._cuts[_FIRST:]):
             left = left.some(~self._exceed(left, cuts, most))
-        for tried in itertools.count():
-            if not left.chosen.shape[0]:
-                break
-            if tried == _SOON and not given and self.is_hopeless(plain):
-                return None
+        while left.chosen.shape[0]:
             one, left = left.first, left.some(slice(1, None))
             points, peak = self._tops(one, most)
             if peak > most:
@@ -470,15 +463,13 @@ class ServoLoop:
                 del self._cuts[_CUTS:]
                 left = left.some(~self._exceed(left, cuts, most))
             elif self.radius(one) >= 1.0:
-                if not given and self.is_hopeless(plain):
-                    return None
                 left = left.some(~self._grow(left, one))
             else:
                 best, most = one, peak
                 if peak <= WITHIN * TARGET:
                     left = left.some(np.count_nonzero(left.chosen, axis=1) <= len(one.notches))
                 left = left.some(~self._exceed(left, self._cuts[:], most))
-        return None if best and not given and self.is_hopeless(plain) else best
+        return best
 
     def _tops(self, law: ServoLaw, most: float) -> tuple[IntArray, float]:
         """Return where |S| of a law peaks, and how high; of a part of the grid if above `most`."""
@@ -500,7 +491,7 @@ class ServoLoop:
         rows = (left @ inverted(L))[:, 0]
         return [Cut(*one) for one in zip(points.tolist(), rows, strict=True)]
 
-    def _exceed(self, laws: Notched, cuts: Sequence[Cut], most: float) -> Bools:
+    def _exceed(self, laws: Notched, cuts: Sequence[Cut], most: float) -> BoolArray:
         """Return whether cuts show that |S| of laws exceeds some size.
 
         ``sigma_max(S) >= |q (I - inner)| / |q (I - L)|`` for every row q. With scaled axes |S| is
@@ -521,7 +512,7 @@ class ServoLoop:
         high = np.linalg.norm(passed, axis=-1) > most * np.linalg.norm(back, axis=-1)
         return np.asarray(high.any(axis=0))
 
-    def _grow(self, laws: Notched, like: ServoLaw) -> Bools:
+    def _grow(self, laws: Notched, like: ServoLaw) -> BoolArray:
         """Return whether the pole that grows most with a like law still grows with some laws.
 
         An estimate: a pole s moves by ``ds/dg (g - 1)`` where they multiply the gain by g at s. In
